@@ -1,0 +1,1 @@
+"""Learners: Bayesian networks that imitate the expert."""

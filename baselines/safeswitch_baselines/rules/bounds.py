@@ -1,0 +1,113 @@
+"""Bounds between which every rule must lie: learner, expert, timer and the two oracles."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from safeswitch.handover.episode import NeverSwitch
+from safeswitch.handover.panel import PHI, Calibration, Panel
+from safeswitch.handover.table import Ints
+from safeswitch.protocols import Calibrated
+from safeswitch_baselines.rules.base import DelayRule, PlainMethod, SignalMethod, ThresholdRule
+
+
+class LearnerOnly(PlainMethod):
+    """`learner`: never hands over."""
+
+    family = "learner"
+
+    def calibrate(self, calibration: Calibration) -> Calibrated:
+        """Nothing to choose."""
+        return Calibrated(NeverSwitch())
+
+
+class ExpertOnly(PlainMethod):
+    """`expert`: hands over at the arming step."""
+
+    family = "expert"
+
+    def calibrate(self, calibration: Calibration) -> Calibrated:
+        """Nothing to choose."""
+        return Calibrated(DelayRule(0))
+
+
+class Timer(PlainMethod):
+    """`timer`: the best single delay after the arming step on the calibrate episodes, whatever the signals say.
+
+    Every delay 0 .. T is tried on every calibrate episode.
+    """
+
+    family = "timer"
+    needs = frozenset({"failures", "rollouts"})
+
+    def calibrate(self, calibration: Calibration) -> Calibrated:
+        """Best mean return over all delays."""
+        panel = calibration.panel
+        delay = panel.best_delay(calibration.phi)
+        episodes = (panel.table.horizon + 1) * len(panel)
+        return Calibrated(DelayRule(delay), threshold=float(delay), tuning_episodes=episodes)
+
+
+class _AtOnset:
+    """Table rule: hands over at t0; undisturbed episodes are left to the learner."""
+
+    def handover_steps(self, panel: Panel) -> Ints:
+        return np.where(panel.table.disturbed, panel.table.onset, panel.table.horizon)
+
+
+class OracleOnset(PlainMethod):
+    """`oracle-onset`: hands over exactly at t0. Privileged: it is told t0."""
+
+    family = "oracle-onset"
+    needs = frozenset({"privileged"})
+
+    def calibrate(self, calibration: Calibration) -> Calibrated:
+        """Nothing to choose."""
+        return Calibrated(_AtOnset())
+
+
+class _Hindsight:
+    """Table rule: per episode, the handover step (or none) with the highest return."""
+
+    def __init__(self, phi: float):
+        self.phi = phi
+
+    def handover_steps(self, panel: Panel) -> Ints:
+        steps = np.arange(panel.table.horizon + 1)
+        handover = panel.executed(np.broadcast_to(steps[:, None], (len(steps), len(panel))))
+        returns = panel.returns(handover, self.phi)
+        allowed = (steps[:, None] >= panel.arming_step[None, :]) | (handover == panel.table.horizon)
+        return handover[np.argmax(np.where(allowed, returns, -np.inf), axis=0), np.arange(len(panel))]
+
+
+class OracleHindsight(PlainMethod):
+    """`oracle-hindsight`: best return over all handover steps and never, episode by episode. Privileged."""
+
+    family = "oracle-hindsight"
+    needs = frozenset({"privileged"})
+
+    def calibrate(self, calibration: Calibration) -> Calibrated:
+        """Nothing to choose: it looks at the outcomes."""
+        return Calibrated(_Hindsight(calibration.phi))
+
+
+class _BestThreshold:
+    """Table rule: the constant threshold that is best on the very episodes it is scored on."""
+
+    def __init__(self, signal: str, phi: float = PHI):
+        self.signal, self.phi = signal, phi
+
+    def handover_steps(self, panel: Panel) -> Ints:
+        threshold, _ = panel.best_threshold(self.signal, self.phi)
+        return ThresholdRule(self.signal, threshold).handover_steps(panel)
+
+
+class BestThreshold(SignalMethod):
+    """`best@signal`: hindsight optimum of a constant threshold on the test episodes, per learner. Privileged."""
+
+    family = "best"
+    needs = frozenset({"privileged"})
+
+    def calibrate(self, calibration: Calibration) -> Calibrated:
+        """The threshold is chosen when it is scored."""
+        return Calibrated(_BestThreshold(self.signal, calibration.phi))

@@ -1,0 +1,215 @@
+"""The command line: bench, demos, train, evaluate, list, play, doctor."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.table import Table
+
+from safeswitch import registry, suite
+from safeswitch.console import console
+
+
+@dataclass
+class Common:
+    """Options that every command on runs shares.
+
+    Attributes:
+        profile: how much is run: smoke, standard or full.
+        task: one task only; all tasks where it is left out.
+        jobs: processes at a time (default: the number of cores); results do not depend on it.
+        store: folder of finished work (default: .safeswitch/store in the checkout, or $SAFESWITCH_STORE).
+        quiet: print errors only.
+    """
+
+    profile: str = "standard"
+    task: str | None = None
+    jobs: int | None = None
+    store: Path | None = None
+    quiet: bool = False
+
+    def runs(self) -> list:
+        """One run per task."""
+        from safeswitch.pipeline import Run
+        from safeswitch.store import Store
+
+        console.quiet = self.quiet
+        if self.jobs is not None and self.jobs < 1:
+            raise ValueError(f"--jobs must be at least 1, got {self.jobs}")
+        tasks = [suite.task(self.task)] if self.task else list(suite.TASKS.values())
+        return [Run(task, suite.profile(self.profile), Store(self.store), self.workers) for task in tasks]
+
+    @property
+    def workers(self) -> int:
+        """Processes at a time."""
+        from joblib import cpu_count
+
+        return self.jobs or cpu_count()
+
+
+@dataclass
+class Bench:
+    """Run the benchmark: demonstrations, training, handover tables, switch rules, leaderboard.
+
+    Attributes:
+        results: where the tables go (default: results/ for the full profile, else results/local/<profile>/).
+    """
+
+    common: tyro.conf.OmitArgPrefixes[Common]
+    results: Path | None = None
+
+    def run(self) -> None:
+        """Do it."""
+        from safeswitch.publish import publish
+
+        for run in self.common.runs():
+            folder = publish(run, self.results)
+            console.print(f"[bold]{run.task.name}[/]: leaderboard in [cyan]{folder / 'leaderboard.md'}[/]")
+
+
+@dataclass
+class Demos:
+    """Record the expert's demonstrations only, as Minari datasets."""
+
+    common: tyro.conf.OmitArgPrefixes[Common]
+
+    def run(self) -> None:
+        """Do it."""
+        for run in self.common.runs():
+            folder = run.store.folder(run.demonstrations.key)
+            console.print(f"{run.task.dataset}: MINARI_DATASETS_PATH={folder}")
+
+
+@dataclass
+class Train:
+    """Train the learners only."""
+
+    common: tyro.conf.OmitArgPrefixes[Common]
+
+    def run(self) -> None:
+        """Do it."""
+        for run in self.common.runs():
+            for job in run.learners:
+                console.print(f"{job.label}: {run.store.folder(job.key)}")
+
+
+@dataclass
+class Evaluate:
+    """Score one method in one cell, exactly, from the handover table.
+
+    Attributes:
+        method: id such as cem@total, or package.module:factory.
+        disturbance: disturbance of the cell.
+        severity: 1 to 5.
+        protocol: onset or start.
+    """
+
+    common: tyro.conf.OmitArgPrefixes[Common]
+    method: str = "cem@total"
+    disturbance: str = "cart-mass"
+    severity: int = 3
+    protocol: str = "onset"
+
+    def run(self) -> None:
+        """Do it."""
+        from safeswitch.evaluate import evaluate
+
+        for run in self.common.runs():
+            row = evaluate(run, self.method, self.disturbance, self.severity, self.protocol)
+            table = Table("score", "value", title=f"{self.method} in {self.disturbance}-{self.severity}")
+            for name, value in row.items():
+                table.add_row(str(name), f"{value:.4g}" if isinstance(value, float) else str(value))
+            console.print(table)
+
+
+@dataclass
+class List:
+    """List tasks with their cells, disturbances, learners, signals, methods and profiles."""
+
+    def run(self) -> None:
+        """Do it."""
+        table = Table("kind", "names", show_lines=True)
+        for task in suite.TASKS.values():
+            table.add_row(f"cells of {task.name}", ", ".join(str(cell).split("/", 1)[1] for cell in task.cells))
+        for kind in registry.GROUPS:
+            table.add_row(f"{kind}s", ", ".join(registry.names(kind)))
+        table.add_row("profiles", ", ".join(suite.PROFILES))
+        console.print(table)
+
+
+@dataclass
+class Play:
+    """Render one episode to a video file.
+
+    Attributes:
+        driver: learner, expert, or a method id such as cem@total.
+        disturbance: disturbance of the cell; none for the undisturbed task.
+        severity: 1 to 5.
+        seed: episode seed.
+        out: file to write, .mp4 or .gif.
+    """
+
+    common: tyro.conf.OmitArgPrefixes[Common]
+    driver: str = "cem@total"
+    disturbance: str = "cart-mass"
+    severity: int = 3
+    protocol: str = "onset"
+    seed: int = 0
+    out: Path = Path("episode.mp4")
+
+    def run(self) -> None:
+        """Do it."""
+        from safeswitch.evaluate import play
+
+        if len(runs := self.common.runs()) != 1:
+            raise ValueError("play needs one task: add --task, for example --task cart-pole")
+        episode = play(
+            runs[0], self.driver, self.disturbance, self.severity, self.protocol, self.seed, self.out
+        )
+        verdict = "success" if episode.success else "failure"
+        handover = episode.handover if episode.handover < episode.horizon else "never"
+        console.print(f"{self.out}: {verdict}, onset {episode.onset}, handover {handover}, {episode.length} steps")
+
+
+@dataclass
+class Doctor:
+    """Check this machine: each thing that the suite needs, with its remedy."""
+
+    def run(self) -> int:
+        """Do it; 1 if something is missing."""
+        from safeswitch.doctor import main as doctor
+
+        return doctor()
+
+
+Command = (
+    Annotated[Bench, tyro.conf.subcommand("bench")]
+    | Annotated[Demos, tyro.conf.subcommand("demos")]
+    | Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[List, tyro.conf.subcommand("list")]
+    | Annotated[Play, tyro.conf.subcommand("play")]
+    | Annotated[Doctor, tyro.conf.subcommand("doctor")]
+)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Entry point of the `safeswitch` command. Returns the exit code: 0 done, 1 failed check, 2 bad input."""
+    command = tyro.cli(Command, prog="safeswitch", description=__doc__, args=arguments)  # type: ignore[call-overload]
+    try:
+        return command.run() or 0
+    except ValueError as error:
+        console.quiet = False
+        console.print(f"[bold red]error:[/] {error}", markup=True)
+        return 2
+    except KeyboardInterrupt:
+        console.print("interrupted; run the same command again to continue")
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

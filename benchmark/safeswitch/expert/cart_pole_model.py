@@ -1,0 +1,118 @@
+r"""Cart-pole for the expert: dynamics and swing-up cost in CasADi, and `make_cart_pole_expert`.
+
+State ``[x, x_dot, theta, theta_dot]`` ([m], [m/s], [rad], [rad/s]); theta = 0 is upright and theta > 0 leans towards +x, the bob
+standing at (x + l sin theta, l cos theta). Action in [-1, 1], force = force_limit * action [N]. From the Lagrangian,
+
+.. math::
+    (m_c + m_p) \ddot x + m_p l \cos\theta\, \ddot\theta &= F - d_x \dot x + m_p l \sin\theta\, \dot\theta^2, \\
+    m_p l \cos\theta\, \ddot x + (I + m_p l^2) \ddot\theta &= m_p g l \sin\theta - d_\theta \dot\theta.
+
+MuJoCo's model is the same; integrated by Runge-Kutta 4 with the same steps the two agree to rounding (see the tests).
+"""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from safeswitch.expert.ddp import Problem, make_solver
+from safeswitch.expert.mpc import MPC, Candidates, MPCConfig, Policy, StationaryGain
+
+Array = NDArray[np.float64]
+
+PARAMETERS: tuple[str, ...] = (
+    "cart_mass",  # [kg]
+    "pole_mass",  # [kg]
+    "pole_length",  # hinge to centre of mass [m]
+    "pole_inertia",  # about the centre of mass [kg m^2]
+    "cart_damping",  # [N s/m]
+    "pole_damping",  # [N m s/rad]
+    "force_limit",  # [N] per unit of action
+)
+GRAVITY = 9.81  # [m/s^2]
+
+WEIGHT_X, WEIGHT_X_DOT, WEIGHT_ANGLE, WEIGHT_THETA_DOT, WEIGHT_ACTION = 1.0, 0.1, 5.0, 0.1, 0.005
+WEIGHT_RAIL, RAIL_SHARE = 200.0, 0.8  # squared hinge beyond this share of the rail: plans stay on it
+WEIGHT_TERMINAL = 10.0  # of the state's cost, at the end of the horizon
+
+
+def acceleration(x: ca.MX, u: ca.MX, p: ca.MX) -> tuple[ca.MX, ca.MX]:
+    """(x_ddot [m/s^2], theta_ddot [rad/s^2]) at state x (4,), action u (1,), parameters p (7,)."""
+    cart_mass, pole_mass, length, inertia, cart_damping, pole_damping, force_limit = ca.vertsplit(p)
+    _, x_dot, theta, theta_dot = ca.vertsplit(x)
+    sin, cos, moment = ca.sin(theta), ca.cos(theta), pole_mass * length
+    m11, m12, m22 = cart_mass + pole_mass, moment * cos, inertia + moment * length
+    force = force_limit * u[0] - cart_damping * x_dot + moment * sin * theta_dot**2
+    torque = GRAVITY * moment * sin - pole_damping * theta_dot
+    determinant = m11 * m22 - m12**2
+    return (m22 * force - m12 * torque) / determinant, (m11 * torque - m12 * force) / determinant
+
+
+def dynamics(control_dt: float, substeps: int = 1) -> ca.Function:
+    """(x, u, p) -> x after `control_dt` [s] of constant action: `substeps` Runge-Kutta 4 steps."""
+    x, u, p = ca.MX.sym("x", 4), ca.MX.sym("u", 1), ca.MX.sym("p", len(PARAMETERS))
+    x_ddot, theta_ddot = acceleration(x, u, p)
+    rate = ca.Function("cart_pole_rate", [x, u, p], [ca.vertcat(x[1], x_ddot, x[3], theta_ddot)])
+    h, end = control_dt / substeps, x
+    for _ in range(substeps):
+        k1 = rate(end, u, p)
+        k2 = rate(end + h / 2 * k1, u, p)
+        k3 = rate(end + h / 2 * k2, u, p)
+        k4 = rate(end + h * k3, u, p)
+        end = end + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    return ca.Function("cart_pole_dynamics", [x, u, p], [end], ["x", "u", "p"], ["x_next"])
+
+
+def state_residual(x: ca.MX, rail: float) -> ca.MX:
+    """Residual of the state's cost, 0.5 |r|^2. The angle enters as (sin, 1 - cos): |.|^2 = 2 (1 - cos theta)."""
+    over = ca.fmax(ca.fabs(x[0]) - RAIL_SHARE * rail, 0)
+    return ca.vertcat(
+        ca.sqrt(WEIGHT_X) * x[0],
+        ca.sqrt(WEIGHT_X_DOT) * x[1],
+        ca.sqrt(WEIGHT_ANGLE) * ca.sin(x[2]),
+        ca.sqrt(WEIGHT_ANGLE) * (1 - ca.cos(x[2])),
+        ca.sqrt(WEIGHT_THETA_DOT) * x[3],
+        ca.sqrt(WEIGHT_RAIL) * over,
+    )
+
+
+def residuals(rail: float) -> tuple[ca.Function, ca.Function]:
+    """Stage residual (x, u, p) -> r and terminal residual (x, p) -> r_N."""
+    x, u, p = ca.MX.sym("x", 4), ca.MX.sym("u", 1), ca.MX.sym("p", len(PARAMETERS))
+    stage = ca.vertcat(state_residual(x, rail), ca.sqrt(WEIGHT_ACTION) * u)
+    terminal = ca.sqrt(WEIGHT_TERMINAL) * state_residual(x, rail)
+    return (
+        ca.Function("cart_pole_residual", [x, u, p], [stage], ["x", "u", "p"], ["r"]),
+        ca.Function("cart_pole_terminal", [x, p], [terminal], ["x", "p"], ["r"]),
+    )
+
+
+def swing_candidates(problem: Problem, control_dt: float) -> Candidates:
+    """Initial policies of a cold start: rest, pushes, one swing to either side, LQR about the nearest upright."""
+    gain = StationaryGain(problem)
+    time = control_dt * np.arange(problem.horizon)[:, None]
+
+    def candidates(state: Array, parameters: Array) -> list[Policy]:
+        upright = np.array([0.0, 0.0, 2 * np.pi * np.round(state[2] / (2 * np.pi)), 0.0])
+        K = gain(upright, np.zeros(1), parameters)
+        # Small swings of a hanging pole on a free cart, as a square wave that pumps energy.
+        period = 2 * np.pi * np.sqrt(parameters[2] / GRAVITY)
+        wave = np.where((time / period) % 1.0 < 0.5, 1.0, -1.0)
+        policies = [Policy(u=amplitude * wave) for amplitude in (0.5, -0.5)]
+        return [Policy(), *policies, Policy(x=upright, K=K)]
+
+    return candidates
+
+
+def make_cart_pole_expert(control_dt: float = 0.06, horizon: int = 34, rail: float = 2.0) -> MPC:
+    """The cart-pole's expert.
+
+    Args:
+        control_dt: [s] duration of an action.
+        horizon: number of actions planned ahead; about 2 s are needed for a swing-up.
+        rail: [m] the cart must stay within |x| <= rail; leaving it is failure.
+    """
+    stage, terminal = residuals(rail)
+    solver = make_solver("cart_pole", dynamics(control_dt), stage, terminal, horizon, -1.0, 1.0)
+    return MPC(solver, swing_candidates(solver.problem, control_dt), MPCConfig(angles=(2,)))

@@ -1,0 +1,183 @@
+"""The one control loop: learner, expert and switch rule share an episode.
+
+An alarm at step t hands over from t + 1, as in the paper: the step on which the rule decides is executed first. The
+learner predicts and the signals are computed at every step, whoever drives; a rule is asked only once it is armed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from safeswitch.protocols import Arming, Array, Driver, Expert, Learner, Signal, SwitchRule
+
+if TYPE_CHECKING:
+    from safeswitch.tasks.base import TaskEnv
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode as it was driven. T is the task's full length; entries after an early end are NaN (driver: -1).
+
+    Attributes:
+        seed: episode seed.
+        onset: step t0 of the disturbance, -1 when undisturbed.
+        arming_step: first step at which the rule was asked.
+        length: steps executed; < T after an early failure.
+        success: the task's criterion at the end.
+        driver: (T,) int8, `Driver` of each step.
+        actions: (T, nu), executed actions in action units.
+        states: (T + 1, nx), full states, SI units.
+        signals: signal id -> (T,).
+        snapshots: (T + 1, ns) environment snapshots, or None when they were not asked for.
+    """
+
+    seed: int
+    onset: int
+    arming_step: int
+    length: int
+    success: bool
+    driver: NDArray[np.int8]
+    actions: Array
+    states: Array
+    signals: Mapping[str, Array] = field(default_factory=dict)
+    snapshots: Array | None = None
+
+    @property
+    def horizon(self) -> int:
+        """Full length T in steps."""
+        return len(self.driver)
+
+    @property
+    def handover(self) -> int:
+        """First step that the expert drives; T if it never does."""
+        driven = np.flatnonzero(self.driver == Driver.EXPERT)
+        return int(driven[0]) if driven.size else self.horizon
+
+    @property
+    def handovers(self) -> int:
+        """How often control passed from the learner to the expert."""
+        driver = np.concatenate([[Driver.LEARNER], self.driver[: self.length]])
+        return int(np.sum((driver[1:] == Driver.EXPERT) & (driver[:-1] == Driver.LEARNER)))
+
+    @property
+    def learner_steps(self) -> int:
+        """Steps that the learner drove."""
+        return int(np.sum(self.driver == Driver.LEARNER))
+
+    @property
+    def armed_learner_steps(self) -> int:
+        """Steps that the learner drove from the arming step on."""
+        return int(np.sum(self.driver[self.arming_step :] == Driver.LEARNER))
+
+
+class NeverSwitch:
+    """The rule that leaves the learner in control."""
+
+    def reset(self, seed: int) -> None:
+        """Nothing to forget."""
+
+    def arm(self, step: int) -> Driver:
+        """The learner drives."""
+        return Driver.LEARNER
+
+    def update(self, step: int, signals: Mapping[str, float]) -> Driver:
+        """The learner drives on."""
+        return Driver.LEARNER
+
+
+def arming_step(onset: int | None, arming: Arming, horizon: int) -> int:
+    """First step at which the monitor is on: t0 under `onset` (T, i.e. never, when undisturbed), 0 under `start`."""
+    if arming == "start":
+        return 0
+    if arming == "onset":
+        return horizon if onset is None or onset < 0 else onset
+    raise ValueError(f"arming {arming!r} is not one of 'onset', 'start'")
+
+
+def run_episode(
+    env: TaskEnv,
+    learner: Learner,
+    signals: Sequence[Signal],
+    rule: SwitchRule,
+    expert: Expert | None,
+    seed: int,
+    arming: Arming = "start",
+    record_snapshots: bool = False,
+) -> Episode:
+    """Drive the episode `seed` of `env` with the learner, and with the expert whenever `rule` says so.
+
+    Args:
+        env: the unwrapped task.
+        learner: predicts at every step; its randomness is keyed by (`seed`, step).
+        signals: what the rule may look at, computed at every step in this order.
+        rule: decides the driver of each step.
+        expert: None is allowed for a rule that never hands over.
+        seed: episode seed.
+        arming: when the rule is switched on.
+        record_snapshots: keep what a later continuation from any step needs.
+    """
+    env.reset(seed=seed)
+    learner.reset(seed)
+    rule.reset(seed)
+    for signal in signals:
+        signal.reset()
+    horizon = env.horizon
+    onset = -1 if env.onset is None else int(env.onset)
+    armed_from = arming_step(env.onset, arming, horizon)
+    driven = np.full(horizon, -1, np.int8)
+    actions = np.full((horizon, env.action_space.shape[0]), np.nan)
+    states = np.full((horizon + 1, env.state.size), np.nan)
+    traces = {signal.id: np.full(horizon, np.nan) for signal in signals}
+    snapshots = [env.snapshot()] if record_snapshots else []
+    states[0] = env.state
+    driver, previous = Driver.LEARNER, None
+    while not env.done:
+        step = env.step_index
+        observation = env.observe()
+        prediction = learner.predict(observation, step)
+        values = {signal.id: signal.update(observation, prediction, previous) for signal in signals}
+        if step == armed_from:
+            driver = rule.arm(step)
+        action = _expert_action(env, expert, driven, step) if driver is Driver.EXPERT else prediction.action
+        env.advance(action)
+        driven[step], actions[step], states[step + 1] = driver, action, env.state
+        for name, value in values.items():
+            traces[name][step] = value
+        if record_snapshots:
+            snapshots.append(env.snapshot())
+        if step >= armed_from:
+            driver = Driver(rule.update(step, values))
+        previous = actions[step]
+    length = env.step_index
+    return Episode(
+        seed, onset, armed_from, length, env.is_success, driven, actions, states, traces, _stack(snapshots, horizon)
+    )
+
+
+def continue_with_expert(env: TaskEnv, expert: Expert) -> bool:
+    """Let the expert drive from the current state, planning from scratch, to the end. True on success."""
+    expert.reset()
+    while not env.done:
+        env.advance(expert.action(env.state, env.parameters))
+    return env.is_success
+
+
+def _expert_action(env: TaskEnv, expert: Expert | None, driven: NDArray[Any], step: int) -> Array:
+    if expert is None:
+        raise ValueError("the switch rule handed over, but the episode was given no expert")
+    if step == 0 or driven[step - 1] != Driver.EXPERT:
+        expert.reset()
+    return expert.action(env.state, env.parameters)
+
+
+def _stack(snapshots: list[Array], horizon: int) -> Array | None:
+    if not snapshots:
+        return None
+    stacked = np.full((horizon + 1, snapshots[0].size), np.nan)
+    stacked[: len(snapshots)] = snapshots
+    return stacked

@@ -1,0 +1,147 @@
+"""READ FIRST: expert -> demonstrations -> learner -> handover tables -> switch rules -> leaderboard.
+
+`bench` runs the stages in this order, one task after the other; `stages.py` says what each stage computes,
+`suite.py` what is run. Finished work is kept in a store by the hash of everything it depends on, so that a second run
+computes nothing and an interrupted one continues where it stopped.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from functools import cached_property
+
+from joblib import Parallel, delayed, parallel_config
+
+from safeswitch import publish
+from safeswitch.console import Progress, console
+from safeswitch.stages import (
+    CellTables,
+    Job,
+    demonstrations_job,
+    episodes_job,
+    learner_job,
+    signals_job,
+    table_jobs,
+)
+from safeswitch.store import Store
+from safeswitch.suite import Profile, Task
+
+
+@dataclass
+class Run:
+    """One task under one profile: each property is a stage, computed when it is first asked for.
+
+    Attributes:
+        task: the task.
+        profile: how much is run.
+        store: where finished work is kept.
+        workers: processes at a time; the results do not depend on it.
+        seconds: wall time spent in each stage by this run.
+    """
+
+    task: Task
+    profile: Profile
+    store: Store
+    workers: int = 2
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @cached_property
+    def demonstrations(self) -> Job:
+        """The Minari dataset of the expert."""
+        job = demonstrations_job(self.store, self.task, self.profile)
+        self.finish("demonstrations", [job])
+        return job
+
+    @cached_property
+    def learners(self) -> list[Job]:
+        """One trained learner per learner seed."""
+        demonstrations = self.demonstrations
+        jobs = [
+            learner_job(self.store, self.task, self.profile, seed, demonstrations)
+            for seed in range(self.profile.learners)
+        ]
+        self.finish("training", jobs)
+        return jobs
+
+    @cached_property
+    def tables(self) -> dict[tuple[int, str], CellTables]:
+        """Handover tables of each (learner seed, cell), on the calibrate and the test split."""
+        cells = self.profile.cells_of(self.task)
+        chunks = {
+            (seed, cell, split): table_jobs(self.store, self.task, cell, split, count, learner)
+            for seed, learner in enumerate(self.learners)
+            for cell in cells
+            for split, count in (("calibrate", self.profile.calibrate), ("test", self.profile.test))
+        }
+        self.finish("handover tables", [job for jobs in chunks.values() for job in jobs])
+        keys = {name: tuple(job.key for job in jobs) for name, jobs in chunks.items()}
+        none = self.task.none_cell
+        return {
+            (seed, str(cell)): CellTables(
+                keys[seed, self.task.calibrated_on(cell), "calibrate"],
+                keys[seed, none, "calibrate"],
+                keys[seed, cell, "test"],
+                keys[seed, none, "test"],
+            )
+            for seed in range(len(self.learners))
+            for cell in cells
+        }
+
+    @cached_property
+    def episodes(self) -> list[Job]:
+        """Every method calibrated and tested in each (learner, cell)."""
+        tables, learners = self.tables, self.learners
+        jobs = [
+            episodes_job(self.store, self.task, cell, seed, learner, tables[seed, str(cell)], self._gives_back(cell))
+            for seed, learner in enumerate(learners)
+            for cell in self.profile.cells_of(self.task)
+        ]
+        self.finish("switch rules", jobs)
+        return jobs
+
+    @cached_property
+    def signals(self) -> list[Job]:
+        """Signal quality in each disturbed (learner, cell)."""
+        tables = self.tables
+        jobs = [
+            signals_job(self.store, self.task, cell, seed, tables[seed, str(cell)])
+            for seed in range(len(self.learners))
+            for cell in self.profile.cells_of(self.task)
+            if cell.tag != "none"
+        ]
+        self.finish("signal quality", jobs)
+        return jobs
+
+    def _gives_back(self, cell: object) -> bool:
+        return cell in self.task.cells[: self.profile.give_back_cells]
+
+    def finish(self, stage: str, jobs: Iterable[Job]) -> None:
+        """Run the jobs that the store does not hold yet, `workers` at a time, with a progress bar."""
+        jobs = list(jobs)
+        started = time.perf_counter()
+        pending = list({job.key: job for job in jobs if not self.store.has(job.key)}.values())
+        with Progress(f"{self.task.name}: {stage}", len(jobs), len(jobs) - len(pending)) as progress:
+            with parallel_config("loky", n_jobs=min(self.workers, max(len(pending), 1)), inner_max_num_threads=1):
+                done = Parallel(return_as="generator_unordered")(
+                    delayed(run_job)(str(self.store.root), job) for job in pending
+                )
+                for label in done:
+                    progress.advance(label)
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - started
+
+
+def run_job(root: str, job: Job) -> str:
+    """Run one job in this process and move its results into the store."""
+    with Store(root).writing(job.key) as folder:
+        job.run(folder, *job.arguments)
+    return job.label
+
+
+def bench(profile: Profile, tasks: Iterable[Task], store: Store, workers: int) -> None:
+    """The main job: every stage of every task, and the published tables after each task."""
+    for task in tasks:
+        run = Run(task, profile, store, workers)
+        folder = publish.publish(run)
+        console.print(f"[bold]{task.name}[/]: leaderboard in [cyan]{folder / 'leaderboard.md'}[/]")

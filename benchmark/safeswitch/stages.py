@@ -1,0 +1,285 @@
+"""The stages of a run as jobs: what each computes, what it depends on, and where the store keeps it.
+
+A job's key hashes its settings, the keys of its inputs, the source of the modules that it runs and the versions of
+the libraries beneath. A finished job is never run again; a change runs again only what depends on it. Every job is a
+pure function of its arguments, so the bits do not depend on the number of workers or on interruptions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import pandas as pd
+
+from safeswitch import demos, registry
+from safeswitch.files import load_frame, save_arrays, save_frame
+from safeswitch.handover.panel import Calibration, Panel
+from safeswitch.handover.table import HandoverTable, concatenate, record_table
+from safeswitch.scoring.rows import episode_rows, latched_rows
+from safeswitch.scoring.signal_quality import signal_quality
+from safeswitch.store import Key, Store
+from safeswitch.suite import Cell, Profile, Split, Task, episode_seeds, methods
+
+if TYPE_CHECKING:
+    from safeswitch.protocols import Method
+    from safeswitch.tasks.base import TaskEnv
+
+CHUNK = 20
+"""Episodes per table job: small enough to resume from and to spread over workers."""
+
+PHYSICS = (
+    "safeswitch.seeding",
+    "safeswitch.tasks.base",
+    "safeswitch.tasks.disturbances",
+    "safeswitch.tasks.models",
+    "safeswitch.expert.codegen",
+    "safeswitch.expert.ddp",
+    "safeswitch.expert.mpc",
+)
+LEARNING = (
+    "safeswitch_baselines.learners.networks",
+    "safeswitch_baselines.learners.bayesian",
+    "safeswitch_baselines.learners.training",
+)
+HANDOVER = ("safeswitch.handover.episode", "safeswitch.handover.table", "safeswitch_baselines.signals")
+RULES = (
+    "safeswitch.handover.panel",
+    "safeswitch.scoring.rows",
+    *(f"safeswitch_baselines.rules.{name}" for name in ("base", "bounds", "cem", "controls", "search", "thresholds")),
+)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One unit of work: `run(folder, *arguments)` writes its results into `folder`, kept under `key`."""
+
+    stage: str
+    label: str
+    key: Key
+    run: Callable[..., None]
+    arguments: tuple[Any, ...]
+
+
+def make_env(task: Task, cell: Cell) -> TaskEnv:
+    """The task's environment in a cell, without Gymnasium's wrappers."""
+    env: Any = gymnasium.make(task.env_id, **cell.env_kwargs).unwrapped
+    return env
+
+
+def demonstrations_job(store: Store, task: Task, profile: Profile) -> Job:
+    """Demonstrations of the expert as a Minari dataset."""
+    settings = {**task.demonstrations, **profile.demonstrations}
+    key = store.key(
+        "demonstrations",
+        {"env": task.env_id, "dataset": task.dataset, **settings},
+        [],
+        [*PHYSICS, *task.code(), "safeswitch.demos"],
+    )
+    return Job("demonstrations", task.name, key, _demonstrate, (task, settings))
+
+
+def _demonstrate(folder: Path, task: Task, settings: dict[str, Any]) -> None:
+    options = dict(settings)
+    seeds = episode_seeds("train", options.pop("episodes"))
+    demos.collect(task.env_id, task.dataset, folder, seeds, **options)
+
+
+def learner_job(store: Store, task: Task, profile: Profile, seed: int, demonstrations: Job) -> Job:
+    """A learner trained on the demonstrations; `seed` draws its initial weights, batches and dropout."""
+    options = {**task.learner_options, **profile.learner_options}
+    settings = {"learner": task.learner, "seed": seed, **options}
+    key = store.key("learner", settings, [demonstrations.key], LEARNING)
+    arguments = (task, options, seed, str(store.folder(demonstrations.key)))
+    return Job("learner", f"{task.name} learner {seed}", key, _train, arguments)
+
+
+def _train(folder: Path, task: Task, options: dict[str, Any], seed: int, dataset_root: str) -> None:
+    factory = registry.find("learner", task.learner)
+    learner = factory.train(demos.load(task.dataset, Path(dataset_root)), seed, options)
+    learner.save(folder)
+
+
+def table_jobs(store: Store, task: Task, cell: Cell, split: Split, count: int, learner: Job) -> list[Job]:
+    """The handover table of one (cell, learner) on the first `count` seeds of a split, in chunks of episodes."""
+    jobs = []
+    for first in range(0, count, CHUNK):
+        size = min(CHUNK, count - first)
+        settings = {
+            "env": task.env_id,
+            "cell": cell.env_kwargs,
+            "split": split,
+            "first": first,
+            "count": size,
+            "signals": list(task.signals),
+        }
+        key = store.key("table", settings, [learner.key], [*PHYSICS, *task.code(), *HANDOVER, *LEARNING])
+        label = f"{cell} {split} {first}-{first + size - 1} ({learner.label})"
+        arguments = (task, cell, split, first, size, str(store.folder(learner.key)))
+        jobs.append(Job("table", label, key, _tabulate, arguments))
+    return jobs
+
+
+def _tabulate(folder: Path, task: Task, cell: Cell, split: Split, first: int, count: int, learner: str) -> None:
+    env = make_env(task, cell)
+    signals = [registry.make_signal(name) for name in task.signals]
+    table = record_table(
+        env, load_learner(task, learner), signals, env.make_expert(), episode_seeds(split, count, first)
+    )
+    table.save(folder / "table.npz")
+    env.close()
+
+
+@cache
+def load_learner(task: Task, folder: str) -> Any:
+    """The trained learner, loaded once per process."""
+    return registry.find("learner", task.learner).load(Path(folder))
+
+
+def load_table(store: Store, jobs: list[Job]) -> HandoverTable:
+    """The chunks of a table put together."""
+    return concatenate([HandoverTable.load(store.folder(job.key) / "table.npz") for job in jobs])
+
+
+@dataclass(frozen=True)
+class CellTables:
+    """Keys of the table chunks that one (learner, cell) is calibrated and tested on."""
+
+    calibrate: tuple[str, ...]
+    calibrate_nominal: tuple[str, ...]
+    test: tuple[str, ...]
+    test_nominal: tuple[str, ...]
+
+
+def episodes_job(
+    store: Store, task: Task, cell: Cell, learner_seed: int, learner: Job, tables: CellTables, give_back: bool
+) -> Job:
+    """Calibrate every method and score it on the test episodes of one (learner, cell), under both armings."""
+    settings = {
+        "cell": str(cell),
+        "learner_seed": learner_seed,
+        "methods": list(methods(task.signals)),
+        "give_back": give_back,
+    }
+    keys = [*tables.calibrate, *tables.calibrate_nominal, *tables.test, *tables.test_nominal]
+    key = store.key("episodes", settings, [learner.key, *keys], RULES)
+    arguments = (str(store.root), task, cell, learner_seed, str(store.folder(learner.key)), tables, give_back)
+    return Job("episodes", f"{cell} learner {learner_seed}", key, _score_episodes, arguments)
+
+
+def _score_episodes(
+    folder: Path,
+    root: str,
+    task: Task,
+    cell: Cell,
+    learner_seed: int,
+    learner: str,
+    tables: CellTables,
+    give_back: bool,
+) -> None:
+    store = Store(Path(root))
+    loaded = {name: _load_chunks(store, getattr(tables, name)) for name in CellTables.__dataclass_fields__}
+    frames, logs = [], {}
+    for protocol in ("start",) if cell.tag == "none" else ("onset", "start"):
+        test = _panel(loaded["test"], loaded["test_nominal"], cell, protocol)
+        on = task.calibrated_on(cell)
+        calibration = Calibration(
+            _panel(loaded["calibrate"], loaded["calibrate_nominal"], on, protocol),
+            loaded["calibrate_nominal"],
+            seed=learner_seed,
+        )
+        for method_id in methods(task.signals):
+            method: Method = registry.make_method(method_id)
+            if not method.latched and not give_back:
+                continue
+            calibrated = method.calibrate(calibration)
+            if method.latched:
+                rows = latched_rows(test, calibrated)
+            else:
+                rows = _plain_rows(task, cell, learner, test, calibrated.rule)
+            frames.append(_labelled(rows, cell, protocol, method_id, learner_seed, calibrated, str(on)))
+            logs.update({f"{protocol}|{method_id}|{name}": value for name, value in calibrated.log.items()})
+    save_frame(folder / "episodes.npz", pd.concat(frames, ignore_index=True))
+    save_arrays(folder / "logs.npz", **logs)
+
+
+def _load_chunks(store: Store, keys: tuple[str, ...]) -> HandoverTable:
+    return concatenate([HandoverTable.load(store.folder(key) / "table.npz") for key in keys])
+
+
+def _panel(table: HandoverTable, nominal: HandoverTable, cell: Cell, protocol: Any) -> Panel:
+    """Disturbed episodes, and under `start` their undisturbed twins beside them."""
+    if cell.tag == "none":
+        return Panel(nominal, protocol)
+    return Panel(concatenate([table, nominal]) if protocol == "start" else table, protocol)
+
+
+def _plain_rows(task: Task, cell: Cell, learner: str, test: Panel, rule: Any) -> pd.DataFrame:
+    """Rules that give control back have no table: drive the same episodes."""
+    from safeswitch.handover.episode import run_episode
+
+    signals = [registry.make_signal(name) for name in task.signals]
+    envs = {True: make_env(task, cell), False: make_env(task, task.none_cell)}
+    experts = {kind: env.make_expert() for kind, env in envs.items()}
+    driver = load_learner(task, learner)
+    episodes = [
+        run_episode(envs[bool(kind)], driver, signals, rule, experts[bool(kind)], int(seed), test.arming)
+        for seed, kind in zip(test.table.seeds, test.table.disturbed, strict=True)
+    ]
+    for env in envs.values():
+        env.close()
+    return episode_rows(test, episodes)
+
+
+def _labelled(
+    rows: pd.DataFrame, cell: Cell, protocol: str, method_id: str, learner_seed: int, calibrated: Any, on: str
+) -> pd.DataFrame:
+    return rows.assign(
+        task=cell.task,
+        disturbance=cell.disturbance,
+        severity=cell.severity,
+        protocol=protocol,
+        method=method_id,
+        learner=learner_seed,
+        threshold=calibrated.threshold,
+        tuning_episodes=calibrated.tuning_episodes,
+        expert_queries=calibrated.expert_queries,
+        calibrated_on=on,
+    )
+
+
+def signals_job(store: Store, task: Task, cell: Cell, learner_seed: int, tables: CellTables) -> Job:
+    """Signal quality of one (learner, cell) against the undisturbed twins."""
+    settings = {"cell": str(cell), "learner_seed": learner_seed, "signals": list(task.signals)}
+    keys = [*tables.test, *tables.test_nominal]
+    key = store.key("signals", settings, keys, ["safeswitch.scoring.signal_quality"])
+    arguments = (str(store.root), task, cell, learner_seed, tables)
+    return Job("signals", f"{cell} learner {learner_seed}", key, _score_signals, arguments)
+
+
+def _score_signals(folder: Path, root: str, task: Task, cell: Cell, learner_seed: int, tables: CellTables) -> None:
+    store = Store(Path(root))
+    disturbed, twins = _load_chunks(store, tables.test), _load_chunks(store, tables.test_nominal)
+    rows = []
+    for signal in task.signals:
+        quality = signal_quality(
+            disturbed.signals[signal],
+            twins.signals[signal],
+            disturbed.onset,
+            disturbed.t_first,
+            disturbed.learner_success,
+        )
+        rows.append({"signal": signal, **asdict(quality)})
+    frame = pd.DataFrame(rows).assign(
+        task=cell.task, disturbance=cell.disturbance, severity=cell.severity, learner=learner_seed
+    )
+    save_frame(folder / "signals.npz", frame)
+
+
+def load_rows(store: Store, jobs: list[Job], name: str) -> pd.DataFrame:
+    """The data frames that jobs wrote as `name`, put together."""
+    return pd.concat([load_frame(store.folder(job.key) / name) for job in jobs], ignore_index=True)

@@ -1,0 +1,190 @@
+"""The one list of tasks, cells, splits, seeds, methods and profiles. A new task or rule adds a line here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from safeswitch.names import unknown
+
+Split = Literal["train", "design", "calibrate", "test"]
+Tag = Literal["paper", "none", "benign", "other"]
+
+SPLITS: tuple[Split, ...] = ("train", "design", "calibrate", "test")
+SPLIT_SIZE = 1_000_000
+"""Seeds per split: split k owns [k SPLIT_SIZE, (k + 1) SPLIT_SIZE), so no two splits share one."""
+
+
+def episode_seeds(split: Split, count: int, first: int = 0) -> list[int]:
+    """Episode seeds `first` .. `first + count - 1` of a split."""
+    if split not in SPLITS:
+        raise unknown("split", split, SPLITS)
+    if not 0 <= first <= first + count <= SPLIT_SIZE:
+        raise ValueError(f"a split has seeds 0 .. {SPLIT_SIZE - 1}, got {first} .. {first + count - 1}")
+    start = SPLITS.index(split) * SPLIT_SIZE + first
+    return list(range(start, start + count))
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One (task, disturbance, severity). Severity is 0 for `none`."""
+
+    task: str
+    disturbance: str
+    severity: int
+    tag: Tag
+
+    def __str__(self) -> str:
+        return f"{self.task}/{self.disturbance}" + (f"-{self.severity}" if self.severity else "")
+
+    @property
+    def env_kwargs(self) -> dict[str, Any]:
+        """Keyword arguments of `gymnasium.make`."""
+        return {} if self.tag == "none" else {"disturbance": self.disturbance, "severity": self.severity}
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is fixed for one task, chosen on the design split and then frozen.
+
+    Attributes:
+        name: as in the tables.
+        env_id: Gymnasium id.
+        learner: registered learner.
+        learner_options: overrides of the learner's configuration.
+        demonstrations: settings of `safeswitch.demos.collect` (episodes, noise).
+        dataset: Minari dataset id.
+        signals: ids of the signals recorded at every step.
+        cells: every cell, the paper's severity 3 first, then `none`, then a benign one.
+        modules: modules of this task alone, which its results depend on.
+        assets: folders under `assets`, which its results depend on.
+    """
+
+    name: str
+    env_id: str
+    learner: str
+    dataset: str
+    signals: tuple[str, ...]
+    cells: tuple[Cell, ...]
+    modules: tuple[str, ...]
+    assets: tuple[str, ...]
+    learner_options: Mapping[str, Any] = field(default_factory=dict)
+    demonstrations: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def paper_cell(self) -> Cell:
+        """The paper's disturbance at severity 3."""
+        return next(cell for cell in self.cells if cell.tag == "paper" and cell.severity == 3)
+
+    @property
+    def none_cell(self) -> Cell:
+        """The undisturbed cell."""
+        return next(cell for cell in self.cells if cell.tag == "none")
+
+    def code(self) -> list[str | Path]:
+        """Modules and asset folders whose content the physics of this task depends on."""
+        from safeswitch.tasks.models import assets_folder  # imports mujoco
+
+        return [*self.modules, *(assets_folder() / name for name in self.assets)]
+
+    def calibrated_on(self, cell: Cell) -> Cell:
+        """Thresholds of `none` and benign cells, in which nothing has to be saved, come from the paper's cell."""
+        return self.paper_cell if cell.tag in ("none", "benign") else cell
+
+
+def _cart_pole_cells() -> tuple[Cell, ...]:
+    name, others = "cart-pole", ("pole-length", "motor-gain", "push", "joint-friction", "sensor-bias", "sensor-noise")
+    return (
+        Cell(name, "cart-mass", 3, "paper"),
+        Cell(name, "none", 0, "none"),
+        Cell(name, "repaint", 3, "benign"),
+        *(Cell(name, "cart-mass", severity, "paper") for severity in (1, 2, 4, 5)),
+        *(Cell(name, other, 3, "other") for other in others),
+    )
+
+
+TASKS: dict[str, Task] = {
+    "cart-pole": Task(
+        name="cart-pole",
+        env_id="SafeSwitch/CartPole-v0",
+        learner="bayesian-mlp",
+        dataset="safeswitch/cart-pole/expert-v0",
+        signals=("epistemic", "aleatoric", "total", "total-mean3", "total-mean5", "epistemic-mean3", "epistemic-mean5"),
+        cells=_cart_pole_cells(),
+        modules=("safeswitch.tasks.cart_pole", "safeswitch.expert.cart_pole_model"),
+        assets=("cart_pole", "common"),
+    ),
+}
+
+
+def task(name: str) -> Task:
+    """The task `name`; an unknown name lists the valid ones."""
+    if name not in TASKS:
+        raise unknown("task", name, TASKS)
+    return TASKS[name]
+
+
+def _methods(signals: tuple[str, ...], rules: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(f"{rule}@{signal}" for signal in signals for rule in rules)
+
+
+BOUNDS = ("learner", "expert", "oracle-onset", "oracle-hindsight", "timer")
+CONTROLS = ("random", "periodic", "shuffled@total")
+QUANTILES = ("fixed-q95", "fixed-q99", "fixed-q999", "fixed-epmax95")
+VALUES = ("fixed-0.05@total", "fixed-0.1@total", "fixed-0.2@total", "fixed-0.4@total")
+CEM_VARIANTS = ("cem-literal@total", "cem-high@total", "cem-low@total")
+PER_SIGNAL = ("cem", "grid", "random-search", *QUANTILES, "best")
+
+
+def methods(signals: tuple[str, ...]) -> tuple[str, ...]:
+    """Every method of the comparison on these signals."""
+    return (*BOUNDS, *CONTROLS, *VALUES, *CEM_VARIANTS, *_methods(signals, PER_SIGNAL))
+
+
+@dataclass(frozen=True)
+class Profile:
+    """How much is run.
+
+    Attributes:
+        name: `smoke`, `standard` or `full`.
+        learners: number of learner seeds.
+        cells: cells per task, from the front of its list; None for all.
+        calibrate: calibrate episodes per (learner, cell).
+        test: test episodes per (learner, cell).
+        give_back_cells: cells, from the front, in which rules that give control back are run as plain episodes.
+        demonstrations: overrides of the task's demonstrations.
+        learner_options: overrides of the learner's configuration.
+        tables: whether the tables of the first three cells are committed with the results.
+    """
+
+    name: str
+    learners: int
+    cells: int | None
+    calibrate: int
+    test: int
+    give_back_cells: int = 0
+    demonstrations: Mapping[str, Any] = field(default_factory=dict)
+    learner_options: Mapping[str, Any] = field(default_factory=dict)
+    tables: bool = False
+
+    def cells_of(self, task: Task) -> tuple[Cell, ...]:
+        """The cells of `task` in this profile."""
+        return task.cells[: self.cells]
+
+
+PROFILES: dict[str, Profile] = {
+    "smoke": Profile(
+        "smoke", 1, 2, 4, 4, demonstrations={"episodes": 12}, learner_options={"hidden": (64, 64), "epochs": 20}
+    ),
+    "standard": Profile("standard", 1, 3, 100, 100),
+    "full": Profile("full", 5, None, 40, 40, give_back_cells=3, tables=True),
+}
+
+
+def profile(name: str) -> Profile:
+    """The profile `name`; an unknown name lists the valid ones."""
+    if name not in PROFILES:
+        raise unknown("profile", name, PROFILES)
+    return PROFILES[name]

@@ -1,0 +1,133 @@
+"""The handover table seen through an arming, on random tables: shortcuts agree with asking a rule step by step."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from safeswitch.handover.panel import Panel
+from safeswitch.handover.table import HandoverTable, concatenate
+from safeswitch_baselines.rules.base import DelayRule, ThresholdRule
+
+HORIZON = 12
+
+
+def random_table(seed: int, episodes: int = 6, disturbed: bool = True) -> HandoverTable:
+    """A table with arbitrary traces and outcomes, early ends included."""
+    rng = np.random.default_rng(seed)
+    success = rng.random(episodes) < 0.5
+    length = np.where(success, HORIZON, rng.integers(7, HORIZON + 1, episodes))
+    onset = rng.integers(1, 6, episodes) if disturbed else np.full(episodes, -1)
+    outcome = rng.random((episodes, HORIZON + 1)) < 0.6
+    signal = rng.integers(0, 6, (episodes, HORIZON)).astype(float)  # ties on purpose
+    ended = np.arange(HORIZON + 1)[None, :] >= length[:, None]
+    outcome = np.where(ended, success[:, None], outcome)
+    signal[ended[:, :-1]] = np.nan
+    return HandoverTable(np.arange(episodes), onset, length, success, {"total": signal}, outcome)
+
+
+class WithoutShortcut:
+    """A rule as an outsider would write it: reset, arm and update only."""
+
+    def __init__(self, rule):
+        self.reset, self.arm, self.update = rule.reset, rule.arm, rule.update
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10_000), st.floats(-1, 6), st.sampled_from(["onset", "start"]))
+def test_threshold_shortcut_agrees_with_asking_step_by_step(seed, threshold, arming):
+    panel = Panel(random_table(seed), arming)
+    rule = ThresholdRule("total", threshold)
+    np.testing.assert_array_equal(panel.handover_of(rule), panel.handover_of(WithoutShortcut(rule)))
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10_000), st.sampled_from(["onset", "start"]))
+def test_best_threshold_is_the_best_of_all_thresholds(seed, arming):
+    panel = Panel(random_table(seed), arming)
+    _, best = panel.best_threshold("total")
+    every = [panel.returns(panel.handover_of(ThresholdRule("total", value))).mean() for value in np.arange(-1, 6.5, 0.5)]
+    assert best == pytest.approx(max(every))
+
+
+@given(st.integers(0, 10_000), st.integers(0, HORIZON + 1), st.sampled_from(["onset", "start"]))
+def test_delay_rule_hands_over_after_the_delay(seed, delay, arming):
+    panel = Panel(random_table(seed), arming)
+    expected = panel.executed(panel.arming_step + delay)
+    np.testing.assert_array_equal(panel.handover_of(DelayRule(delay)), expected)
+
+
+def test_return_counts_learner_steps_from_the_arming_step_and_phi_on_success():
+    outcome = np.ones((1, HORIZON + 1), bool)
+    table = HandoverTable(
+        np.array([0]), np.array([4]), np.array([HORIZON]), np.array([True]), {"total": np.zeros((1, HORIZON))}, outcome
+    )
+    assert Panel(table, "onset").returns(np.array([7]), phi=5.0)[0] == pytest.approx(3 / HORIZON + 5)
+    assert Panel(table, "start").returns(np.array([7]), phi=2.0)[0] == pytest.approx(7 / HORIZON + 2)
+
+
+def test_t_first_and_t_last_by_hand():
+    outcome = np.zeros((3, HORIZON + 1), bool)
+    outcome[0, [2, 3, 4, 6]] = True  # onset 2: unbroken until 4, once more at 6
+    outcome[1, [0, 1]] = True  # onset 2: no recoverable step
+    outcome[2, :] = True  # the learner alone succeeds
+    table = HandoverTable(
+        np.arange(3),
+        np.array([2, 2, 2]),
+        np.array([10, 10, HORIZON]),
+        np.array([False, False, True]),
+        {},
+        outcome,
+    )
+    np.testing.assert_array_equal(table.t_first, [4, np.nan, HORIZON])
+    np.testing.assert_array_equal(table.t_last, [6, np.nan, HORIZON])
+
+
+@given(st.integers(0, 10_000))
+def test_t_first_by_definition(seed):
+    table = random_table(seed)
+    for episode in range(len(table)):
+        onset, length = table.onset[episode], table.length[episode]
+        good = [s for s in range(onset, length) if table.outcome[episode, onset : s + 1].all()]
+        last = [s for s in range(onset, length) if table.outcome[episode, s]]
+        if table.learner_success[episode]:
+            assert table.t_first[episode] == table.t_last[episode] == HORIZON
+        else:
+            np.testing.assert_equal(table.t_first[episode], float(good[-1]) if good else np.nan)
+            np.testing.assert_equal(table.t_last[episode], float(last[-1]) if last else np.nan)
+
+
+def test_onset_arming_refuses_undisturbed_episodes():
+    with pytest.raises(ValueError, match="disturbed"):
+        Panel(random_table(0, disturbed=False), "onset")
+
+
+def test_unknown_signal_names_the_valid_ones():
+    with pytest.raises(ValueError, match="total"):
+        Panel(random_table(0), "start").signal("totl")
+
+
+def test_table_round_trip(tmp_path):
+    table = concatenate([random_table(1), random_table(2, disturbed=False)])
+    table.save(tmp_path / "table.npz")
+    again = HandoverTable.load(tmp_path / "table.npz")
+    for name in ("seeds", "onset", "length", "learner_success", "outcome"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(table, name))
+    np.testing.assert_array_equal(again.signals["total"], table.signals["total"])
+
+
+@given(st.integers(0, 10_000))
+def test_margins_hold_exactly_the_worthwhile_thresholds_around_the_best(seed):
+    panel = Panel(random_table(seed), "onset")
+    low, high = panel.margins("total")
+    best, value = panel.best_threshold("total")
+    if np.isnan(low):
+        assert value <= panel.trivial_return()
+        return
+    assert low <= best < high
+    inside = [low, best]
+    for threshold in inside:
+        assert panel.returns(panel.handover_at("total", threshold)[0]).mean() > panel.trivial_return()
+    if np.isfinite(high):
+        assert panel.returns(panel.handover_at("total", high)[0]).mean() <= panel.trivial_return()
