@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Prepares this checkout: system packages if they are missing (Linux only), then .venv with the package installed in
-# editable mode. Usage: scripts/setup.sh [EXTRAS], EXTRAS as in pyproject.toml (default: dev). Does nothing, in well
-# under a second, when pyproject.toml and constraints.txt are as they were at the last successful run.
+# editable mode. Usage: scripts/setup.sh [EXTRAS], EXTRAS as in pyproject.toml (default: dev). Changes nothing, within a
+# second or so, when pyproject.toml and constraints.txt are as they were at the last successful run.
 #
 # PYTHON                   interpreter for .venv (default: the first suitable of python3, python3.12, python3.11)
 # SAFESWITCH_SKIP_SYSTEM=1 go on without the system packages (no rendering, or a slower expert)
@@ -85,7 +85,8 @@ install_debian() {
     sudo apt-get update && sudo apt-get install -y --no-install-recommends ${debian[*]}"
   fi
   say "installing Debian packages: ${debian[*]}"
-  "${command[@]}" update -qq >&2 && "${command[@]}" install -y -qq --no-install-recommends "${debian[@]}" >&2 \
+  # Quiet but for errors, which apt-get writes to standard error.
+  "${command[@]}" update -qq >/dev/null && "${command[@]}" install -y -qq --no-install-recommends "${debian[@]}" >/dev/null \
     || die "apt-get failed. Once it works again: apt-get update && apt-get install -y ${debian[*]}"
 }
 

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from safeswitch.handover.panel import Panel
-from safeswitch.handover.table import HandoverTable, concatenate
+from safeswitch.handover.panel import Calibration, Panel
+from safeswitch.handover.table import HandoverTable, concatenate, new_table
 from safeswitch_baselines.rules.base import DelayRule, ThresholdRule
+from safeswitch_baselines.rules.bounds import OracleHindsight
 
 HORIZON = 12
 
@@ -24,7 +25,7 @@ def random_table(seed: int, episodes: int = 6, disturbed: bool = True) -> Handov
     ended = np.arange(HORIZON + 1)[None, :] >= length[:, None]
     outcome = np.where(ended, success[:, None], outcome)
     signal[ended[:, :-1]] = np.nan
-    return HandoverTable(np.arange(episodes), onset, length, success, {"total": signal}, outcome)
+    return new_table(np.arange(episodes), onset, length, success, {"total": signal}, outcome)
 
 
 class WithoutShortcut:
@@ -60,7 +61,7 @@ def test_delay_rule_hands_over_after_the_delay(seed, delay, arming):
 
 def test_return_counts_learner_steps_from_the_arming_step_and_phi_on_success():
     outcome = np.ones((1, HORIZON + 1), bool)
-    table = HandoverTable(
+    table = new_table(
         np.array([0]), np.array([4]), np.array([HORIZON]), np.array([True]), {"total": np.zeros((1, HORIZON))}, outcome
     )
     assert Panel(table, "onset").returns(np.array([7]), phi=5.0)[0] == pytest.approx(3 / HORIZON + 5)
@@ -72,7 +73,7 @@ def test_t_first_and_t_last_by_hand():
     outcome[0, [2, 3, 4, 6]] = True  # onset 2: unbroken until 4, once more at 6
     outcome[1, [0, 1]] = True  # onset 2: no recoverable step
     outcome[2, :] = True  # the learner alone succeeds
-    table = HandoverTable(
+    table = new_table(
         np.arange(3),
         np.array([2, 2, 2]),
         np.array([10, 10, HORIZON]),
@@ -89,8 +90,9 @@ def test_t_first_by_definition(seed):
     table = random_table(seed)
     for episode in range(len(table)):
         onset, length = table.onset[episode], table.length[episode]
-        good = [s for s in range(onset, length) if table.outcome[episode, onset : s + 1].all()]
-        last = [s for s in range(onset, length) if table.outcome[episode, s]]
+        known = table.known()[episode]
+        good = [s for s in range(onset, length) if known[onset : s + 1].all()]
+        last = [s for s in range(onset, length) if known[s]]
         if table.learner_success[episode]:
             assert table.t_first[episode] == table.t_last[episode] == HORIZON
         else:
@@ -112,7 +114,8 @@ def test_table_round_trip(tmp_path):
     table = concatenate([random_table(1), random_table(2, disturbed=False)])
     table.save(tmp_path / "table.npz")
     again = HandoverTable.load(tmp_path / "table.npz")
-    for name in ("seeds", "onset", "length", "learner_success", "outcome"):
+    np.testing.assert_array_equal(again.known(), table.known())
+    for name in ("seeds", "onset", "length", "learner_success"):
         np.testing.assert_array_equal(getattr(again, name), getattr(table, name))
     np.testing.assert_array_equal(again.signals["total"], table.signals["total"])
 
@@ -131,3 +134,32 @@ def test_margins_hold_exactly_the_worthwhile_thresholds_around_the_best(seed):
         assert panel.returns(panel.handover_at("total", threshold)[0]).mean() > panel.trivial_return()
     if np.isfinite(high):
         assert panel.returns(panel.handover_at("total", high)[0]).mean() <= panel.trivial_return()
+
+
+@given(st.integers(0, 10_000), st.sampled_from(["onset", "start"]), st.sampled_from([0.05, 5.0]))
+def test_hindsight_oracle_earns_the_maximum_over_all_steps_and_never(seed, arming, phi):
+    panel = Panel(random_table(seed), arming)
+    chosen = panel.returns(panel.handover_of(OracleHindsight().calibrate(Calibration(panel, panel.table, phi)).rule), phi)
+    for episode in range(len(panel)):
+        one = panel.take(np.array([episode]))
+        steps = [*range(int(one.arming_step[0]), int(one.table.length[0])), HORIZON]
+        assert chosen[episode] == pytest.approx(max(one.returns(np.array([step]), phi)[0] for step in steps))
+
+
+def test_unknown_outcomes_are_resolved_once_and_shared_with_parts():
+    calls = []
+    base = new_table(
+        np.arange(2), np.array([1, 1]), np.array([5, HORIZON]), np.array([False, True]), {}, np.full((2, HORIZON + 1), -1)
+    )
+    base.sources[0].resolve = lambda episode, step: calls.append((episode, step)) or step < 3
+    joined = concatenate([base.take(np.array([0])), base])
+    assert joined.outcome(np.array([0, 0, 1]), np.array([2, 4, 4])).tolist() == [True, False, False]
+    assert sorted(calls) == [(0, 2), (0, 4)]
+    assert base.outcome(np.array([1, 0]), np.array([HORIZON, 2])).tolist() == [True, True]
+    assert len(calls) == 2
+
+
+def test_unknown_outcomes_without_a_simulator_are_an_error():
+    table = new_table(np.arange(1), np.array([1]), np.array([5]), np.array([False]), {}, np.full((1, HORIZON + 1), -1))
+    with pytest.raises(LookupError, match="without a simulator"):
+        table.outcome(np.array([0]), np.array([2]))

@@ -31,6 +31,7 @@ from safeswitch.store import (
     load_frame,
     load_json,
     save_arrays,
+    save_arrays_compressed,
     save_frame,
     save_json,
 )
@@ -293,7 +294,7 @@ def test_arrays_have_the_same_bytes_every_time(tmp_path: Path, monkeypatch: pyte
     assert (tmp_path / "one.npz").read_bytes() == (tmp_path / "two.npz").read_bytes()
     loaded = load_arrays(tmp_path / "one.npz")
     assert list(loaded) == list(arrays) and loaded["start|cem@total|mu"].dtype == np.float32
-    save_arrays(tmp_path / "small.npz", compress=True, zeros=np.zeros(10_000))
+    save_arrays_compressed(tmp_path / "small.npz", zeros=np.zeros(10_000))
     assert (tmp_path / "small.npz").stat().st_size < 2000
     np.testing.assert_array_equal(load_arrays(tmp_path / "small.npz")["zeros"], np.zeros(10_000))
 

@@ -1,1 +1,1 @@
-"""SafeSwitch baselines: learners, signals and switch rules that compete on the benchmark. Imports `safeswitch`, never the reverse."""
+"""SafeSwitch baselines: learners, signals and switch rules. They import `safeswitch`, never the reverse."""

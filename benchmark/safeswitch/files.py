@@ -53,17 +53,14 @@ def jsonable(value: Any, where: str = "settings", nan_as_null: bool = False) -> 
     raise TypeError(f"{where} is of type {type(value).__name__}, which JSON cannot hold")
 
 
-def save_arrays(path: Path | str, /, compress: bool = False, **arrays: ArrayLike) -> None:
+def save_arrays(path: Path | str, /, **arrays: ArrayLike) -> None:
     """Write `arrays` to one .npz file: atomic, no pickle (so no object arrays), the same bytes for the same arrays."""
-    method = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
-    with _replacing(Path(path)) as temporary, zipfile.ZipFile(temporary, "w", method) as archive:
-        for name, array in arrays.items():
-            # np.savez stamps the time of writing on every member; ZipInfo alone has a fixed date.
-            member = zipfile.ZipInfo(f"{name}.npy")
-            member.compress_type = method
-            member.external_attr = 0o644 << 16
-            with archive.open(member, "w", force_zip64=True) as file:
-                np.lib.format.write_array(file, np.asanyarray(array), allow_pickle=False)
+    _write_npz(Path(path), arrays, zipfile.ZIP_STORED)
+
+
+def save_arrays_compressed(path: Path | str, /, **arrays: ArrayLike) -> None:
+    """As `save_arrays`, smaller and slower: for files that are kept or committed."""
+    _write_npz(Path(path), arrays, zipfile.ZIP_DEFLATED)
 
 
 def load_arrays(path: Path | str) -> dict[str, NDArray[Any]]:
@@ -72,7 +69,7 @@ def load_arrays(path: Path | str) -> dict[str, NDArray[Any]]:
         return {name: archive[name] for name in archive.files}
 
 
-def save_frame(path: Path | str, frame: pd.DataFrame, compress: bool = False) -> None:
+def save_frame(path: Path | str, frame: pd.DataFrame) -> None:
     """Write a data frame to one .npz file, an array a column; the index is not kept.
 
     Columns may be bool, int, float or text. Text must not have missing values.
@@ -86,7 +83,7 @@ def save_frame(path: Path | str, frame: pd.DataFrame, compress: bool = False) ->
             columns[str(name)] = np.array(values.tolist(), dtype=np.str_)
         else:
             columns[str(name)] = values.to_numpy()
-    save_arrays(path, compress, **columns)
+    save_arrays(path, **columns)
 
 
 def load_frame(path: Path | str) -> pd.DataFrame:
@@ -118,6 +115,17 @@ def atomic_write_bytes(path: Path | str, data: bytes) -> None:
     """Write `data`; a reader sees the old file or the new one, never a part."""
     with _replacing(Path(path)) as temporary:
         temporary.write_bytes(data)
+
+
+def _write_npz(path: Path, arrays: Mapping[str, ArrayLike], method: int) -> None:
+    with _replacing(path) as temporary, zipfile.ZipFile(temporary, "w", method) as archive:
+        for name, array in arrays.items():
+            # np.savez stamps the time of writing on every member; ZipInfo alone has a fixed date.
+            member = zipfile.ZipInfo(f"{name}.npy")
+            member.compress_type = method
+            member.external_attr = 0o644 << 16
+            with archive.open(member, "w", force_zip64=True) as file:
+                np.lib.format.write_array(file, np.asanyarray(array), allow_pickle=False)
 
 
 @contextlib.contextmanager

@@ -13,7 +13,10 @@ def nearest(value: object, valid: Iterable[str]) -> list[str]:
 
 
 def unknown(kind: str, value: object, valid: Iterable[str]) -> ValueError:
-    """Error to raise for an unknown `value` of some `kind`, for example ``raise unknown("task", "cartpole", TASKS)``."""
+    """The error that an unknown `value` of some `kind` deserves.
+
+    For example ``raise unknown("task", "cartpole", TASKS)``.
+    """
     names = nearest(value, valid)
     listing = ", ".join(names) if names else "there are none"
     return ValueError(f"unknown {kind} {value!r}; valid, nearest first: {listing}")

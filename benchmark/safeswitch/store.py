@@ -46,6 +46,7 @@ from safeswitch.files import (
     load_frame,
     load_json,
     save_arrays,
+    save_arrays_compressed,
     save_frame,
     save_json,
 )
@@ -62,6 +63,7 @@ __all__ = [
     "load_frame",
     "load_json",
     "save_arrays",
+    "save_arrays_compressed",
     "save_frame",
     "save_json",
 ]

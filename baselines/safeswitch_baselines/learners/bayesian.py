@@ -4,60 +4,56 @@
     epistemic_var = var_k mu_k            (population variance)
     aleatoric_var = mean_k sigma_k^2
 
-The K masks of a decision are a function of (episode seed, environment step) alone (`MaskStream`). Two runs that visit the same state at the same step therefore predict the same bits,
-whatever was predicted before, in whichever process and with however many workers. Only one torch thread is used, and
-weights and buffers lie in memory that torch aligned itself, because matrix products may round differently otherwise.
+The K masks of a decision are a function of (episode seed, environment step) alone (`MaskStream`). Two runs that visit
+the same state at the same step therefore predict the same bits, whatever was predicted before, in whichever process
+and with however many workers. Only one torch thread is used, and weights and buffers lie in memory that torch aligned
+itself, because matrix products may round differently otherwise.
 """
 
 from __future__ import annotations
 
-import json
-import shutil
-import tempfile
+import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load, save
 
+from safeswitch.files import atomic_write_bytes, load_json, save_json
 from safeswitch.protocols import Prediction
 from safeswitch.seeding import seed_sequence
 from safeswitch_baselines.learners.networks import (
     BayesianMLP,
     InputEncoding,
+    MaskLayout,
     MLPConfig,
     bounded_log_var_numpy,
 )
 
+if TYPE_CHECKING:
+    from safeswitch.demos import Demonstrations
+    from safeswitch_baselines.learners.training import Progress
+
 FORMAT = "safeswitch-bayesian-mlp-1"
-_WEIGHTS, _CONFIG = "model.safetensors", "config.json"
-_MASK_LEVELS = 1 << 16
+WEIGHTS, CONFIG = "model.safetensors", "config.json"
 
 
 class MaskStream:
-    """Keep-masks of the dropout units, keyed by (episode seed, step).
+    """Dropout masks of the decisions, keyed by (episode seed, step).
 
-    The seed keys one long PCG64DXSM sequence and step s reads its own stretch of it, reached by a jump. A unit is kept
-    when a uniform 16-bit number is at least rate * 65536, so a rate is met to 1 / 65536. Row k is the k-th sample.
+    The seed keys one long PCG64DXSM sequence, and step s reads its own stretch of it, reached by a jump.
 
     Args:
-        samples: K.
-        widths: units of each hidden layer.
-        rates: their dropout rates; a layer with rate 0 has no mask.
+        config: widths, dropout rates and K.
     """
 
-    def __init__(self, samples: int, widths: Sequence[int], rates: Sequence[float]) -> None:
-        used = [width if rate > 0 else 0 for width, rate in zip(widths, rates, strict=True)]
-        edges = np.cumsum([0, *used])
-        self._columns = [slice(int(a), int(b)) if b > a else None for a, b in pairwise(edges)]
-        self._limits = np.repeat([round(rate * _MASK_LEVELS) for rate in rates], used).astype(np.uint16)
-        self._shape = (samples, len(self._limits))
-        self._words = -(-samples * len(self._limits) // 4)  # four 16-bit numbers out of each 64-bit word
+    def __init__(self, config: MLPConfig) -> None:
+        self._layout = MaskLayout.of(config)
+        self._samples = config.samples
         self.reset(0)
 
     def reset(self, seed: int) -> None:
@@ -66,70 +62,61 @@ class MaskStream:
         self._start = self._bits.state
 
     def draw(self, step: int) -> list[NDArray[np.bool_] | None]:
-        """Masks of environment step `step`, one (K, width) per hidden layer; True keeps the unit."""
+        """Masks of environment step `step`, one (K, width) per hidden layer, None without dropout."""
         self._bits.state = self._start
-        self._bits.advance(step * self._words)
-        numbers = self._bits.random_raw(self._words).view(np.uint16)[: self._shape[0] * self._shape[1]]
-        keep = numbers.reshape(self._shape) >= self._limits
-        return [keep[:, columns] if columns is not None else None for columns in self._columns]
+        self._bits.advance(step * self._layout.words(self._samples))
+        return self._layout.draw(self._bits, self._samples)
 
 
 class _Network:
     """The layers of a `BayesianMLP` frozen for single decisions: all samples in one pass, no autograd.
 
-    Layers up to the first one with dropout are the same for all samples and computed once, and its units that ReLU
-    switches off are off in every sample, so the next product leaves them out. The scale 1 / (1 - rate) of kept units
-    is folded into the weights that read them.
+    Layers up to the first one with dropout are the same for all samples and computed once. The scale 1 / (1 - rate) of
+    kept units is folded into the weights that read them.
     """
 
     def __init__(self, model: BayesianMLP, samples: int) -> None:
         linears = model.linears()
         scales = [1.0, *(1.0 / (1.0 - rate) for rate in model.rates)]
-        self._depth = len(model.rates)
-        self._first = next((index for index, rate in enumerate(model.rates) if rate > 0), self._depth)
         # `clone` puts every matrix into memory that torch aligned; a tensor read from a file need not be.
         self._weights = [
             (layer.weight.detach().cpu() * scale).t().contiguous().clone()
             for layer, scale in zip(linears, scales, strict=True)
         ]
         self._biases = [layer.bias.detach().cpu().clone() for layer in linears]
+        # Outputs are computed transposed: a product with two long columns takes twice the time of two long rows.
+        self._weights[-1] = self._weights[-1].t().contiguous()
+        self._biases[-1] = self._biases[-1][:, None]
+        depth = len(model.rates)
+        first = next((index for index, rate in enumerate(model.rates) if rate > 0), depth)
         self._input = torch.empty(1, linears[0].in_features)
-        rows = [1 if index <= self._first else samples for index in range(self._depth)]
-        self._hidden = [torch.empty(n, len(bias)) for n, bias in zip(rows, self._biases[:-1], strict=True)]
-        self._views = [hidden.numpy() for hidden in self._hidden]  # the same memory, for numpy's faster masking
-        width = self._hidden[self._first].shape[1] if self._first < self._depth else 0
-        self._masked = torch.empty(samples * width)
-        self._samples = samples
+        self._input_view = self._input.numpy()
+        self._hidden = [
+            torch.empty(1 if index <= first else samples, len(bias)) for index, bias in enumerate(self._biases[:-1])
+        ]
+        self._masked = [
+            torch.empty(samples, hidden.shape[1]) if index == first else hidden
+            for index, hidden in enumerate(self._hidden)
+        ]
+        # The same memory seen by numpy, which is faster at the small element-wise steps.
+        self._hidden_views = [hidden.numpy() for hidden in self._hidden]
+        self._masked_views = [masked.numpy() for masked in self._masked]
+        self._output = torch.empty(linears[-1].out_features, 1 if first == depth else samples)
+        self._output_view = self._output.numpy()
 
     def __call__(
         self, inputs: NDArray[np.float64], masks: Sequence[NDArray[np.bool_] | None]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Raw outputs (K, 2 nu), or (1, 2 nu) without dropout, and the first hidden layer (h,), before its dropout."""
-        self._input.numpy()[...] = inputs
-        hidden, weight = self._input, self._weights[0]
-        for index in range(self._depth):
-            torch.addmm(self._biases[index], hidden, weight, out=self._hidden[index])
-            view = self._views[index]
-            np.maximum(view, 0.0, out=view)
-            mask = masks[index]
-            if index == self._first and mask is not None:
-                hidden, weight = self._spread(view[0], mask, self._weights[index + 1])
-                continue
+    ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+        """Raw outputs (2 nu, K), or (2 nu, 1) without dropout, and the first hidden layer (h,), before its dropout."""
+        self._input_view[...] = inputs
+        reading = self._input
+        for index, mask in enumerate(masks):
+            torch.addmm(self._biases[index], reading, self._weights[index], out=self._hidden[index]).relu_()
             if mask is not None:
-                np.multiply(view, mask, out=view)
-            hidden, weight = self._hidden[index], self._weights[index + 1]
-        # Transposed, because a product with two long columns is twice as slow as one with two long rows.
-        output = torch.addmm(self._biases[-1][:, None], weight.t(), hidden.t())
-        return output.numpy().T, self._views[0][0].copy()
-
-    def _spread(
-        self, shared: NDArray[np.float32], mask: NDArray[np.bool_], weight: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Masked copies (K, a) of the a active units of the shared layer (h,), and the weights that read them."""
-        active = np.flatnonzero(shared)
-        hidden = self._masked[: self._samples * len(active)].view(self._samples, len(active))
-        np.multiply(shared[active], mask[:, active], out=hidden.numpy())
-        return hidden, weight.index_select(0, torch.from_numpy(active))
+                np.multiply(self._hidden_views[index], mask, out=self._masked_views[index])
+            reading = self._masked[index]
+        torch.addmm(self._biases[-1], self._weights[-1], reading.t(), out=self._output)
+        return self._output_view.astype(np.float64), self._hidden_views[0][0].copy()
 
 
 class BayesianLearner:
@@ -158,7 +145,7 @@ class BayesianLearner:
     def _prepare(self) -> None:
         """Build what `predict` needs from the model."""
         self._network = _Network(self.model, self.config.samples)
-        self._masks = MaskStream(self.config.samples, self.config.hidden, self.config.rates)
+        self._masks = MaskStream(self.config)
 
     @property
     def observation_shape(self) -> tuple[int, ...]:
@@ -178,9 +165,8 @@ class BayesianLearner:
         masks = self._masks.draw(_checked_step(step))
         with one_thread(), torch.inference_mode():
             output, features = self._network(inputs, masks)
-        samples = output.astype(np.float64)
-        action, epistemic_var, aleatoric_var = moments(samples, self.model.actions, self.config.log_var_bounds)
-        return Prediction(np.clip(action, -1.0, 1.0), epistemic_var, aleatoric_var, features)
+        action, epistemic_var, aleatoric_var = moments(output, self.model.actions, self.config.log_var_bounds)
+        return Prediction(np.minimum(np.maximum(action, -1.0), 1.0), epistemic_var, aleatoric_var, features)
 
     def _checked(self, observation: NDArray[Any]) -> NDArray[np.float64]:
         value = np.asarray(observation, dtype=np.float64)
@@ -193,46 +179,57 @@ class BayesianLearner:
             raise ValueError(f"observation must be finite; got {value.tolist()}")
         return value
 
+    @classmethod
+    def train(
+        cls, demos: Demonstrations, seed: int, options: Mapping[str, Any] | None = None, progress: Progress = False
+    ) -> BayesianLearner:
+        """Train on demonstrations; `options` are fields of `MLPConfig`. See `training.train_bayesian_mlp`."""
+        from safeswitch_baselines.learners.training import train_bayesian_mlp
+
+        return train_bayesian_mlp(demos, seed, MLPConfig.from_json(options or {}), progress)
+
     def save(self, folder: Path | str) -> Path:
-        """Write weights (safetensors), config and history (JSON) to `folder`, replacing it as a whole."""
+        """Write weights (safetensors), config and history (JSON) into `folder`.
+
+        Each file appears whole or not at all, and the config, written last, holds the hash of the weights.
+        """
+        path = Path(folder)
         tensors = {f"network.{key}": value.contiguous() for key, value in self.model.state_dict().items()}
         # float64: predictions of a loaded learner are the same bits.
         tensors["encoding.mean"] = torch.from_numpy(self.encoding.mean)
         tensors["encoding.scale"] = torch.from_numpy(self.encoding.scale)
+        weights = save(tensors)
         description = {
             "format": FORMAT,
-            "observation_shape": list(self.encoding.observation_shape),
+            "weights_sha256": hashlib.sha256(weights).hexdigest(),
+            "observation_shape": self.encoding.observation_shape,
             "actions": self.model.actions,
             "config": self.config.to_json(),
             "history": self.history,
         }
-        with replaced_folder(Path(folder)) as fresh:
-            save_file(tensors, fresh / _WEIGHTS)
-            (fresh / _CONFIG).write_text(json.dumps(description, indent=1) + "\n", encoding="utf-8")
-        return Path(folder)
+        atomic_write_bytes(path / WEIGHTS, weights)
+        save_json(path / CONFIG, description)
+        return path
 
     @classmethod
     def load(cls, folder: Path | str) -> BayesianLearner:
-        """Learner saved by `save`; predicts the same bits on the same machine."""
+        """Learner saved by `save`; it predicts the same bits on the same machine."""
         path = Path(folder)
-        for name in (_CONFIG, _WEIGHTS):
+        for name in (CONFIG, WEIGHTS):
             if not (path / name).is_file():
                 raise FileNotFoundError(f"{path} holds no saved Bayesian learner: {name} is missing")
-        description = json.loads((path / _CONFIG).read_text(encoding="utf-8"))
+        description = load_json(path / CONFIG)
         if description.get("format") != FORMAT:
-            raise ValueError(f"{path / _CONFIG}: format {description.get('format')!r} is not {FORMAT!r}")
+            raise ValueError(f"{path / CONFIG}: format is {description.get('format')!r}, expected {FORMAT!r}")
+        weights = (path / WEIGHTS).read_bytes()
+        if hashlib.sha256(weights).hexdigest() != description["weights_sha256"]:
+            raise ValueError(f"{path / WEIGHTS} is not the file that {CONFIG} describes: save the learner again")
         config = MLPConfig.from_json(description["config"])
-        tensors = load_file(path / _WEIGHTS)
-        encoding = InputEncoding(
-            tuple(description["observation_shape"]),
-            config.angles,
-            tensors.pop("encoding.mean").numpy().copy(),
-            tensors.pop("encoding.scale").numpy().copy(),
-        )
-        # The generator only keeps the initial weights, replaced at once, from touching torch's global one.
-        model = BayesianMLP(encoding.size, description["actions"], config, torch.Generator().manual_seed(0))
-        model.load_state_dict({key.removeprefix("network."): value for key, value in tensors.items()})
-        return cls(model, encoding, config, description["history"])
+        tensors = load(weights)
+        mean, scale = (tensors.pop(f"encoding.{name}").numpy().copy() for name in ("mean", "scale"))
+        encoding = InputEncoding(tuple(description["observation_shape"]), config.angles, mean, scale)
+        state = {key.removeprefix("network."): value for key, value in tensors.items()}
+        return cls(_network_of(state, encoding, config), encoding, config, description["history"])
 
     def __getstate__(self) -> dict[str, Any]:
         """What a copy in another process is rebuilt from."""
@@ -243,21 +240,29 @@ class BayesianLearner:
         """Rebuild the network in this process's own aligned memory."""
         self.encoding, self.config, self.history = state["encoding"], state["config"], state["history"]
         weights = {key: torch.tensor(value) for key, value in state["weights"].items()}
-        actions = len(weights["output.bias"]) // 2
-        self.model = BayesianMLP(self.encoding.size, actions, self.config, torch.Generator().manual_seed(0)).eval()
-        self.model.load_state_dict(weights)
+        self.model = _network_of(weights, self.encoding, self.config).eval()
         self._prepare()
 
 
+def _network_of(state: Mapping[str, torch.Tensor], encoding: InputEncoding, config: MLPConfig) -> BayesianMLP:
+    """Network with the given weights."""
+    # The generator only keeps the initial weights, replaced at once, from touching torch's global one.
+    generator = torch.Generator().manual_seed(0)
+    model = BayesianMLP(encoding.size, len(state["output.bias"]) // 2, config, generator)
+    model.load_state_dict(dict(state))
+    return model
+
+
 def moments(
-    samples: NDArray[np.float64], actions: int, bounds: tuple[float, float]
+    output: NDArray[np.float64], actions: int, bounds: tuple[float, float]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Mean action, epistemic and aleatoric variance, each (nu,), from raw network outputs (K, 2 nu)."""
-    mu, raw = samples[:, :actions], samples[:, actions:]
-    action = mu.sum(axis=0) / len(mu)
-    deviation = mu - action
-    epistemic_var = (deviation * deviation).sum(axis=0) / len(mu)
-    aleatoric_var = np.exp(bounded_log_var_numpy(raw, bounds)).sum(axis=0) / len(mu)
+    """Mean action, epistemic and aleatoric variance, each (nu,), from raw network outputs (2 nu, K)."""
+    samples = output.shape[1]
+    mu, raw = output[:actions], output[actions:]
+    action = np.add.reduce(mu, axis=1) / samples
+    deviation = mu - action[:, None]
+    epistemic_var = np.add.reduce(deviation * deviation, axis=1) / samples
+    aleatoric_var = np.add.reduce(np.exp(bounded_log_var_numpy(raw, bounds)), axis=1) / samples
     return action, epistemic_var, aleatoric_var
 
 
@@ -273,25 +278,6 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
-
-
-@contextmanager
-def replaced_folder(folder: Path) -> Iterator[Path]:
-    """An empty folder to write to; it takes the place of `folder` when the block ends without an error."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    try:
-        yield fresh
-        fresh.chmod(0o755)
-        if folder.exists():
-            old = Path(tempfile.mkdtemp(prefix=f".{folder.name}-old-", dir=folder.parent))
-            folder.replace(old / folder.name)
-            fresh.replace(folder)
-            shutil.rmtree(old)
-        else:
-            fresh.replace(folder)
-    finally:
-        shutil.rmtree(fresh, ignore_errors=True)
 
 
 def _checked_step(step: int) -> int:

@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,6 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from safeswitch.names import unknown
-
 
 LOSSES = ("nll", "beta-nll")
 
@@ -125,6 +125,14 @@ class InputEncoding:
     angles: tuple[int, ...]
     mean: NDArray[np.float64]
     scale: NDArray[np.float64]
+    _angle_index: NDArray[np.intp] = field(init=False, repr=False, compare=False)
+    _other_index: NDArray[np.intp] = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Index arrays, made once because every decision needs them."""
+        others = [index for index in range(self.observation_shape[0]) if index not in self.angles]
+        object.__setattr__(self, "_angle_index", np.array(self.angles, dtype=np.intp))
+        object.__setattr__(self, "_other_index", np.array(others, dtype=np.intp))
 
     @classmethod
     def fit(cls, observations: NDArray[Any], angles: Sequence[int]) -> InputEncoding:
@@ -134,11 +142,11 @@ class InputEncoding:
         size = observations.shape[1]
         if any(index >= size for index in angles):
             raise ValueError(f"angles={tuple(angles)} must be indices of an observation of {size} components")
-        raw = _with_angles(np.asarray(observations, dtype=np.float64), tuple(angles))
-        deviation = raw.std(axis=0)
+        plain = cls((size,), tuple(angles), np.zeros(1), np.ones(1))(observations)
+        deviation = plain.std(axis=0)
         # A constant component carries nothing: dividing by its rounding noise would only amplify it.
         scale = np.where(deviation > 1e-6, deviation, 1.0)
-        return cls((size,), tuple(angles), raw.mean(axis=0), scale)
+        return cls((size,), tuple(angles), plain.mean(axis=0), scale)
 
     @property
     def size(self) -> int:
@@ -146,18 +154,12 @@ class InputEncoding:
         return len(self.mean)
 
     def __call__(self, observations: NDArray[Any]) -> NDArray[np.float64]:
-        """Encode observations (n, d) as (n, e), float64."""
-        raw = _with_angles(np.asarray(observations, dtype=np.float64), self.angles)
+        """Encode observations (n, d) as (n, e), float64: other components in their order, then sines, then cosines."""
+        raw = np.asarray(observations, dtype=np.float64)
+        if self.angles:
+            theta = raw[:, self._angle_index]
+            raw = np.concatenate([raw[:, self._other_index], np.sin(theta), np.cos(theta)], axis=1)
         return (raw - self.mean) / self.scale
-
-
-def _with_angles(observations: NDArray[np.float64], angles: tuple[int, ...]) -> NDArray[np.float64]:
-    """The components that are no angles in their order, then the sines, then the cosines."""
-    if not angles:
-        return observations
-    rest = [index for index in range(observations.shape[1]) if index not in angles]
-    theta = observations.take(angles, axis=1)
-    return np.concatenate([observations.take(rest, axis=1), np.sin(theta), np.cos(theta)], axis=1)
 
 
 class BayesianMLP(nn.Module):
@@ -180,8 +182,7 @@ class BayesianMLP(nn.Module):
         )
         self.output = nn.utils.skip_init(nn.Linear, widths[-1], 2 * actions)
         for layer in self.linears():
-            nonlinearity = "linear" if layer is self.output else "relu"
-            nn.init.kaiming_uniform_(layer.weight, nonlinearity=nonlinearity, generator=generator)
+            nn.init.kaiming_uniform_(layer.weight, nonlinearity="relu", generator=generator)
             nn.init.zeros_(layer.bias)
         with torch.no_grad():
             self.output.weight.mul_(0.1)  # first predictions near 0, first variances near 1
@@ -193,27 +194,50 @@ class BayesianMLP(nn.Module):
     def forward(self, inputs: Tensor, masks: Sequence[Tensor | None] | None = None) -> tuple[Tensor, Tensor]:
         """Mean and log-variance, each (n, nu), for network inputs (n, e).
 
-        `masks` has one (n, width) entry per hidden layer, 1 for a kept unit and 0 for a dropped one (None: keep all).
-        Kept units are scaled by 1 / (1 - rate). Without masks the network is deterministic (weight scaling).
+        `masks` has one entry (n, width) per hidden layer: 0 for a dropped unit, 1 / (1 - rate) for a kept one; None
+        keeps all. Without masks the network is deterministic (weight scaling).
         """
         hidden = inputs
         for index, layer in enumerate(self.layers):
             hidden = torch.relu(layer(hidden))
             mask = masks[index] if masks is not None else None
             if mask is not None:
-                hidden = hidden * (mask * (1.0 / (1.0 - self.rates[index])))
+                hidden = hidden * mask
         mean, raw = self.output(hidden).split(self.actions, dim=1)
         return mean, bounded_log_var(raw, self.bounds)
 
-    def draw_masks(self, n: int, generator: torch.Generator) -> list[Tensor | None]:
-        """Independent masks of `n` samples, from `generator` (on the device of the network)."""
-        device = self.output.weight.device
-        return [
-            torch.empty(n, layer.out_features, device=device).bernoulli_(1.0 - rate, generator=generator)
-            if rate > 0
-            else None
-            for layer, rate in zip(self.linears()[:-1], self.rates, strict=True)
-        ]
+
+@dataclass(frozen=True)
+class MaskLayout:
+    """Where the dropout units of the layers lie in one block of random numbers (rows, units).
+
+    A unit is kept when a uniform 16-bit number is at least rate * 65536, so a rate is met to 1 / 65536.
+
+    Attributes:
+        columns: the block's columns of each hidden layer; None for a layer without dropout.
+        limits: (units,), smallest number that keeps each unit.
+    """
+
+    columns: tuple[slice | None, ...]
+    limits: NDArray[np.uint16]
+
+    @classmethod
+    def of(cls, config: MLPConfig) -> MaskLayout:
+        """Layout of the hidden layers of `config`."""
+        used = [width if rate > 0 else 0 for width, rate in zip(config.hidden, config.rates, strict=True)]
+        limits = np.repeat([round(rate * 65536) for rate in config.rates], used).astype(np.uint16)
+        columns = tuple(slice(int(a), int(b)) if b > a else None for a, b in pairwise(np.cumsum([0, *used])))
+        return cls(columns, limits)
+
+    def words(self, rows: int) -> int:
+        """64-bit words that `rows` rows take from a bit generator."""
+        return -(-rows * len(self.limits) // 4)
+
+    def draw(self, bits: np.random.BitGenerator, rows: int) -> list[NDArray[np.bool_] | None]:
+        """Independent masks, one (rows, width) per hidden layer; True keeps the unit."""
+        numbers = bits.random_raw(self.words(rows)).view(np.uint16)[: rows * len(self.limits)]
+        keep = numbers.reshape(rows, len(self.limits)) >= self.limits
+        return [None if columns is None else keep[:, columns] for columns in self.columns]
 
 
 def bounded_log_var(raw: Tensor, bounds: tuple[float, float]) -> Tensor:

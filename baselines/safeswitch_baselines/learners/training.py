@@ -8,34 +8,25 @@ whatever else the machine does.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from safeswitch.demos import Demonstrations
 from safeswitch.names import unknown
 from safeswitch.seeding import seed_sequence, stream
 from safeswitch_baselines.learners.bayesian import BayesianLearner, one_thread
-from safeswitch_baselines.learners.networks import BayesianMLP, InputEncoding, MLPConfig, gaussian_nll
+from safeswitch_baselines.learners.networks import BayesianMLP, InputEncoding, MaskLayout, MLPConfig, gaussian_nll
 
 History = dict[str, list[float]]
 Progress = bool | Callable[[int, int], None]
 """True: a rich progress bar. A function: called with (epochs done, epochs). False: quiet."""
 
-CONFIGS: dict[str, MLPConfig] = {"cart-pole": MLPConfig(angles=(2,))}
-"""Default configuration of each task that has a state observation."""
-
 DEVICES = ("auto", "cpu", "cuda")
-
-
-def config_for(task: str) -> MLPConfig:
-    """Default configuration of a task, for example ``config_for("cart-pole")``."""
-    if task not in CONFIGS:
-        raise unknown("task of a Bayesian MLP", task, CONFIGS)
-    return CONFIGS[task]
 
 
 def train_bayesian_mlp(
@@ -50,7 +41,7 @@ def train_bayesian_mlp(
     Args:
         demos: observations (n, d), clean expert labels (n, nu) in action units, episode index (n,).
         seed: learner seed; decides initial weights, order of the samples, masks and the validation episodes.
-        config: see `MLPConfig`; `config_for(task)` gives a task's default.
+        config: see `MLPConfig`; None for its defaults.
         progress: True for a progress bar, a function for a bar of one's own.
         device: "auto" trains on a GPU where there is one; "cpu" or "cuda" choose. Decisions always run on the CPU.
 
@@ -85,7 +76,8 @@ def fit(
     n = len(inputs)
     steps = math.ceil(n / config.batch_size)
     order = _generator(seed, "sample-order")
-    masks = _generator(seed, "training-masks", inputs.device)
+    layout = MaskLayout.of(config)
+    bits = np.random.PCG64DXSM(seed_sequence(seed, "training-masks"))
     optimiser = _optimiser(model, config)
     history: History = {"loss": [], "learning_rate": []}
     model.train()
@@ -97,6 +89,7 @@ def fit(
             for step in range(steps):
                 rate = _learning_rate(config, epoch * steps + step, config.epochs * steps)
                 chosen = permutation[step * config.batch_size : (step + 1) * config.batch_size]
+                masks = scaled_masks(layout.draw(bits, len(chosen)), config.rates, inputs.device)
                 loss = batch_loss(model, inputs[chosen], labels[chosen], masks, config, warm_up)
                 _descend(model, optimiser, loss, rate, config.max_gradient_norm)
                 total += loss.detach() * len(chosen)
@@ -111,11 +104,26 @@ def fit(
     return history
 
 
+def scaled_masks(
+    keep: Sequence[NDArray[np.bool_] | None], rates: Sequence[float], device: torch.device
+) -> list[Tensor | None]:
+    """Factors of the hidden units from keep-masks: 0 for a dropped unit, 1 / (1 - rate) for a kept one."""
+    return [
+        None if mask is None else torch.from_numpy(mask * np.float32(1.0 / (1.0 - rate))).to(device)
+        for mask, rate in zip(keep, rates, strict=True)
+    ]
+
+
 def batch_loss(
-    model: BayesianMLP, inputs: Tensor, labels: Tensor, masks: torch.Generator, config: MLPConfig, warm_up: bool
+    model: BayesianMLP,
+    inputs: Tensor,
+    labels: Tensor,
+    masks: Sequence[Tensor | None],
+    config: MLPConfig,
+    warm_up: bool = False,
 ) -> Tensor:
-    """Loss of one batch, summed over action components and averaged over samples, under fresh dropout masks."""
-    mean, log_var = model(inputs, model.draw_masks(len(inputs), masks))
+    """Loss of one batch, summed over action components and averaged over samples."""
+    mean, log_var = model(inputs, masks)
     if warm_up:
         loss = 0.5 * (labels - mean) ** 2
     else:
@@ -131,9 +139,7 @@ def evaluate(model: BayesianMLP, inputs: Tensor, labels: Tensor) -> tuple[float,
         return nll, math.sqrt(((mean - labels) ** 2).mean().item())
 
 
-def _descend(
-    model: BayesianMLP, optimiser: torch.optim.Optimizer, loss: Tensor, rate: float, max_norm: float
-) -> None:
+def _descend(model: BayesianMLP, optimiser: torch.optim.Optimizer, loss: Tensor, rate: float, max_norm: float) -> None:
     for group in optimiser.param_groups:
         group["lr"] = rate
     optimiser.zero_grad(set_to_none=True)
@@ -193,9 +199,8 @@ def _device(name: str) -> torch.device:
     return torch.device(name)
 
 
-def _generator(seed: int, name: str, device: torch.device | None = None) -> torch.Generator:
-    generator = torch.Generator(device or torch.device("cpu"))
-    return generator.manual_seed(int(seed_sequence(seed, name).generate_state(1, np.uint64)[0] >> np.uint64(1)))
+def _generator(seed: int, name: str) -> torch.Generator:
+    return torch.Generator().manual_seed(int(seed_sequence(seed, name).generate_state(1, np.uint64)[0] >> np.uint64(1)))
 
 
 @contextmanager

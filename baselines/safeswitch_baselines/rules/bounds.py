@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from safeswitch.handover.episode import NeverSwitch
-from safeswitch.handover.panel import PHI, Calibration, Panel
+from safeswitch.handover.panel import DELAY_STEP, PHI, Calibration, Panel
 from safeswitch.handover.table import Ints
 from safeswitch.protocols import Calibrated
 from safeswitch_baselines.rules.base import DelayRule, PlainMethod, SignalMethod, ThresholdRule
@@ -34,7 +34,7 @@ class ExpertOnly(PlainMethod):
 class Timer(PlainMethod):
     """`timer`: the best single delay after the arming step on the calibrate episodes, whatever the signals say.
 
-    Every delay 0 .. T is tried on every calibrate episode.
+    Delays are tried on every calibrate episode, at the resolution of `Panel.best_delay`.
     """
 
     family = "timer"
@@ -44,7 +44,7 @@ class Timer(PlainMethod):
         """Best mean return over all delays."""
         panel = calibration.panel
         delay = panel.best_delay(calibration.phi)
-        episodes = (panel.table.horizon + 1) * len(panel)
+        episodes = (panel.table.horizon // DELAY_STEP + 1) * len(panel)
         return Calibrated(DelayRule(delay), threshold=float(delay), tuning_episodes=episodes)
 
 
@@ -73,11 +73,19 @@ class _Hindsight:
         self.phi = phi
 
     def handover_steps(self, panel: Panel) -> Ints:
-        steps = np.arange(panel.table.horizon + 1)
-        handover = panel.executed(np.broadcast_to(steps[:, None], (len(steps), len(panel))))
-        returns = panel.returns(handover, self.phi)
-        allowed = (steps[:, None] >= panel.arming_step[None, :]) | (handover == panel.table.horizon)
-        return handover[np.argmax(np.where(allowed, returns, -np.inf), axis=0), np.arange(len(panel))]
+        return np.array([self._best(panel, episode) for episode in range(len(panel))])
+
+    def _best(self, panel: Panel, episode: int) -> int:
+        """The latest handover that succeeds, or never where that earns more; a later one always earns more."""
+        table, never = panel.table, panel.table.horizon
+        if table.learner_success[episode]:
+            return never
+        start, length = int(panel.arming_step[episode]), int(table.length[episode])
+        for step in range(length - 1, start - 1, -1):
+            if table.outcome(np.array([episode]), np.array([step]))[0]:
+                alone = (length - start) / never
+                return step if (step - start) / never + self.phi >= alone else never
+        return never
 
 
 class OracleHindsight(PlainMethod):

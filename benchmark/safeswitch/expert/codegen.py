@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 # No -ffast-math: it gains nothing here, breaks isfinite, and a library linked with it switches the whole process to
 # flush-to-zero. -ffp-contract=off keeps the compiled code equal to CasADi's virtual machine to the last bits, which
 # matters because a line search amplifies a rounding difference.
-FLAGS: tuple[str, ...] = ("-O3", "-march=native", "-fno-math-errno", "-ffp-contract=off", "-fPIC", "-shared")
+FLAGS: tuple[str, ...] = ("-O3", "-march=native", "-fno-math-errno", "-ffp-contract=off", "-fno-semantic-interposition")
+FLAGS += ("-fPIC", "-shared")
 
 COMPILER_HINT = "on Debian or Ubuntu: apt-get install -y gcc libc6-dev"
 

@@ -17,17 +17,56 @@ MU_MIN, MU_MAX, MU_FACTOR = 1e-6, 1e10, 1.6  # regularisation schedule of Tassa 
 MU_CONVERGED = 1e-5  # a plan only counts as converged below this regularisation
 TRIALS = 11  # line search: alpha = 10^0, 10^-0.3, ... 10^-3
 ARMIJO = 1e-4  # smallest accepted ratio of actual to expected decrease
-QP_ITERATIONS = 16  # projected Newton, two or more controls
-QP_STEPS = tuple(0.6**i for i in range(12))
+QP_ITERATIONS = 32  # projected Newton, two or more controls
+QP_STEPS = (1.0, 0.3, 0.1)
 
 
 def expanded(name: str, inputs: list[ca.MX], outputs: list[ca.MX]) -> ca.Function:
     """Function of scalar operations where possible (interpolants, for one, cannot be expanded)."""
     function = ca.Function(name, inputs, [ca.densify(output) for output in outputs], {"cse": True})
     try:
-        return function.expand(name, {"cse": True})
+        return with_reciprocals(function.expand(name, {"cse": True}))
     except RuntimeError:
         return function
+
+
+def with_reciprocals(function: ca.Function) -> ca.Function:
+    """The same scalar function with a / b as a * (1 / b), each 1 / b computed once.
+
+    Derivatives of a quotient divide by the same denominator over and over, and a division costs several products.
+    """
+    simplified = ca.GlobalOptions.getSimplificationOnTheFly()
+    ca.GlobalOptions.setSimplificationOnTheFly(False)  # it would turn a * (1 / b) back into a / b
+    try:
+        inputs, outputs = _rebuilt(function)
+        return ca.Function(function.name(), inputs, outputs, function.name_in(), function.name_out())
+    finally:
+        ca.GlobalOptions.setSimplificationOnTheFly(simplified)
+
+
+def _rebuilt(function: ca.Function) -> tuple[list[ca.SX], list[ca.SX]]:
+    """Inputs and outputs of a scalar function, rebuilt operation by operation with shared reciprocals."""
+    inputs = [ca.SX.sym(f"i{i}", function.sparsity_in(i)) for i in range(function.n_in())]
+    outputs = [ca.SX(function.sparsity_out(i)) for i in range(function.n_out())]
+    work: list[ca.SX] = [ca.SX(0)] * function.sz_w()
+    reciprocals: dict[int, ca.SX] = {}
+    for step in range(function.n_instructions()):
+        operation, source = function.instruction_id(step), function.instruction_input(step)
+        target = function.instruction_output(step)
+        if operation == ca.OP_CONST:
+            work[target[0]] = ca.SX(function.instruction_constant(step))
+        elif operation == ca.OP_INPUT:
+            work[target[0]] = inputs[source[0]].nz[source[1]]
+        elif operation == ca.OP_OUTPUT:
+            outputs[target[0]].nz[target[1]] = work[source[0]]
+        elif operation == ca.OP_DIV:
+            below = work[source[1]]
+            work[target[0]] = work[source[0]] * reciprocals.setdefault(below.element_hash(), 1 / below)
+        elif len(source) == 2:
+            work[target[0]] = ca.SX.binary(operation, work[source[0]], work[source[1]])
+        else:
+            work[target[0]] = ca.SX.unary(operation, work[source[0]])
+    return inputs, outputs
 
 
 def bounded_while(body: ca.Function, most: int) -> ca.Function:
@@ -106,10 +145,15 @@ def solve_spd(H: ca.MX, R: ca.MX) -> tuple[ca.MX, ca.MX]:
     return ca.vertcat(*rows), smallest
 
 
+def symmetric(matrix: ca.MX) -> ca.MX:
+    """The symmetric matrix with the upper triangle of `matrix`: half the work, and no drift."""
+    return ca.triu2symm(ca.triu(matrix))
+
+
 def box_qp_function(name: str, nu: int) -> ca.Function:
     """(H, q, lo, hi) -> (k, free): minimiser of 0.5 k'Hk + q'k within [lo, hi], and 1 where k is not held by a bound.
 
-    One control: exact. More: projected Newton (Tassa 2014, section III; Bertsekas 1982), at most QP_ITERATIONS.
+    One control: exact. More: projected Newton (Tassa 2014, section III; Bertsekas 1982), at most QP_ITERATIONS steps.
     """
     H, q = ca.MX.sym("H", nu, nu), ca.MX.sym("q", nu)
     lo, hi = ca.MX.sym("lo", nu), ca.MX.sym("hi", nu)
@@ -122,20 +166,22 @@ def box_qp_function(name: str, nu: int) -> ca.Function:
     free = box_free(H, q, lo, hi, k)
     mask = ca.diag(free)
     step, _ = solve_spd(mask @ H @ mask + ca.diag(1 - free), -free * (q + H @ k))
-    value = ca.dot(q + 0.5 * H @ k, k)
-    best, accepted = k, ca.MX(0)
-    for alpha in reversed(QP_STEPS):  # from the shortest: the longest acceptable step has the last word
+    best, value = k, ca.dot(q + 0.5 * H @ k, k)
+    for alpha in QP_STEPS:
         trial = ca.fmin(ca.fmax(k + alpha * step, lo), hi)
-        decrease, slope = value - ca.dot(q + 0.5 * H @ trial, trial), ca.dot(q + H @ k, k - trial)
-        good = ca.logic_and(decrease >= 0.1 * slope, decrease > 0)
-        best, accepted = ca.if_else(good, trial, best), ca.logic_or(good, accepted)
-    gradient = ca.mmax(ca.fabs(box_free(H, q, lo, hi, best) * (q + H @ best)))
-    running = ca.logic_and(accepted, gradient > state[1])
+        trial_value = ca.dot(q + 0.5 * H @ trial, trial)
+        best, value = ca.if_else(trial_value < value, trial, best), ca.fmin(value, trial_value)
+    # A clipped Newton step need not descend. One sweep of exact coordinate minimisation always does, and finds the
+    # active bounds; with them Newton's step is exact.
+    for i in range(nu):
+        moved = best[i] - (q[i] + H[i, :] @ best) / H[i, i]
+        best = ca.vertcat(best[:i], ca.fmin(ca.fmax(moved, lo[i]), hi[i]), best[i + 1 :])
+    running = ca.mmax(ca.fabs(box_free(H, q, lo, hi, best) * (q + H @ best))) > state[1]
     body = expanded(f"{name}_newton", [state, k, H, q, lo, hi], [ca.vertcat(running, state[1]), best])
     loop = bounded_while(body, QP_ITERATIONS)
 
     finish = expanded(f"{name}_free", [H, q, lo, hi, k], [box_free(H, q, lo, hi, k)])
-    start = ca.vertcat(1, 1e-13 * (1 + ca.mmax(ca.fabs(q))))
+    start = ca.vertcat(1, 1e-11 * (1 + ca.mmax(ca.fabs(q))))
     _, solution = loop(start, ca.fmin(ca.fmax(ca.MX.zeros(nu), lo), hi), H, q, lo, hi)
     return ca.Function(name, [H, q, lo, hi], [solution, finish(H, q, lo, hi, solution)])
 
@@ -163,10 +209,10 @@ def expansion_function(problem: Problem) -> ca.Function:
     if problem.second_order:
         slope_x, slope_u = A.T @ Vx, B.T @ Vx
         Qxx, Qux, Quu = Qxx + ca.jacobian(slope_x, x), Qux + ca.jacobian(slope_u, x), Quu + ca.jacobian(slope_u, u)
-    outputs = [Qx, Qu, Qxx, Qux, Quu, Qux + mu * (B.T @ A), Quu + mu * (B.T @ B)]
+    outputs = [Qx, Qu, symmetric(Qxx), Qux, symmetric(Quu), Qux + mu * (B.T @ A), Quu + mu * (B.T @ B)]
     outputs += [ca.DM(problem.u_lo) - u, ca.DM(problem.u_hi) - u]
     inner = ca.Function("expansion", [Vx, Vxx, x, u, p, mu], outputs)
-    outputs = inner(Vx, Vxx, row[:nx], row[nx:], p, mu)
+    outputs = inner(Vx, symmetric(Vxx), row[:nx], row[nx:], p, mu)
     return expanded(f"{problem.name}_expansion", [Vx, Vxx, row, p, mu], list(outputs))
 
 
@@ -188,7 +234,7 @@ def gains_function(problem: Problem) -> ca.Function:
     Vxx = Qxx + K.T @ Quu @ K + K.T @ Qux + Qux.T @ K
     failed = ca.logic_not(pivot > 0)  # true for a NaN too
     linear, quadratic = ca.dot(k, Qu), 0.5 * ca.dot(k, Quu @ k)
-    carry = ca.vertcat(Vx, ca.vec(0.5 * (Vxx + Vxx.T)), sums + ca.vertcat(linear, quadratic, failed))
+    carry = ca.vertcat(Vx, ca.vec(symmetric(Vxx)), sums + ca.vertcat(linear, quadratic, failed))
     inputs = [k, free, Qx, Qu, Qxx, Qux, Quu, Qux_mu, Quu_mu, sums]
     return expanded(f"{problem.name}_gains", inputs, [carry, ca.vec(K)])
 

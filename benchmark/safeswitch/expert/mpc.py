@@ -11,6 +11,7 @@ The answer is always finite and within the bounds: when the solver fails, the la
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -54,15 +55,17 @@ class MPCConfig:
         polish_iterations: further iterations on the best candidate.
         tolerance: relative expected decrease at which a plan counts as converged.
         angles: indexes of the state's components that are angles [rad]; they may arrive wrapped or unwrapped.
-        surprise: a warm plan whose cost exceeds the last one's by this factor (plus 1) is challenged by a cold start.
+        surprise: a warm plan is challenged by a cold start when its cost exceeds the last one's by this factor and
+        surprise_margin: by this much.
     """
 
     warm_iterations: int = 10
-    cold_iterations: int = 40
+    cold_iterations: int = 20
     polish_iterations: int = 100
     tolerance: float = 1e-5
     angles: tuple[int, ...] = ()
     surprise: float = 1.2
+    surprise_margin: float = 1.0
 
 
 class MPC:
@@ -110,11 +113,10 @@ class MPC:
             ValueError: for a state or parameters of the wrong shape. Non-finite numbers are answered from the last plan.
         """
         state, parameters = self._checked(state, parameters)
-        with np.errstate(all="ignore"):
-            if not (np.isfinite(state).all() and np.isfinite(parameters).all() and self._replan(state, parameters)):
-                return self._fall_back()
-        self._age = 0
-        return np.minimum(np.maximum(self._plan[0, self._nx :], self._lo), self._hi)
+        finite = all(map(math.isfinite, state.tolist())) and all(map(math.isfinite, parameters.tolist()))
+        if not (finite and self._replan(state, parameters)):
+            return self._fall_back()
+        return self._plan[0, self._nx :].copy()  # within the bounds: the roll-out clips every control
 
     @property
     def plan_x(self) -> Array:
@@ -143,10 +145,10 @@ class MPC:
         """Make a plan from `state`: warm if there is one to start from. False when no finite plan was found."""
         if self._age < 0:
             return self._cold(state, parameters)
-        expected, changed = self._cost, not np.array_equal(parameters, self._parameters)
+        expected, changed = self._cost, bool((parameters != self._parameters).any())
         good = self._warm(state, parameters)
         # Another model, or a cost that jumped (a push): the shifted plan may sit in a poor local minimum.
-        if not good or changed or self._cost > self.config.surprise * expected + 1.0:
+        if not good or changed or self._cost > self.config.surprise * expected + self.config.surprise_margin:
             good = self._cold(state, parameters, challenge=good)
         return good
 
@@ -206,12 +208,12 @@ class MPC:
         if self._age < 0:
             return 0.5 * (self._lo + self._hi)
         self._age = min(self._age + 1, self._gains.shape[0] - 1)
-        return np.minimum(np.maximum(self._plan[self._age, self._nx :], self._lo), self._hi)
+        return self._plan[self._age, self._nx :].copy()
 
 
 def _wrapped(angle: float) -> float:
-    """Angle in [-pi, pi)."""
-    return float((angle + np.pi) % (2 * np.pi) - np.pi)
+    """The same angle in [-pi, pi]."""
+    return math.remainder(angle, math.tau)
 
 
 def gain_function(problem: Problem, steps: int) -> ca.Function:

@@ -16,6 +16,9 @@ from safeswitch.protocols import ARMINGS, Arming, Array, Driver, SwitchRule
 PHI = 5.0
 """Reward of success in the headline, in units of a whole episode driven by the learner (DESIGN section 2)."""
 
+DELAY_STEP = 5
+"""Resolution of the timer [steps]."""
+
 
 @dataclass(frozen=True)
 class Panel:
@@ -100,7 +103,7 @@ class Panel:
 
     def success(self, handover: Ints) -> Bools:
         """Success (..., E) of handing over at the steps (..., E)."""
-        return self.table.outcome[np.arange(len(self)), handover]
+        return self.table.outcome(np.arange(len(self)), handover)
 
     def learner_steps(self, handover: Ints) -> Ints:
         """Steps (..., E) that the learner drives, from step 0."""
@@ -155,10 +158,13 @@ class Panel:
         return max(float(self.returns(handover, phi).mean()) for handover in choices)
 
     def best_delay(self, phi: float = PHI) -> int:
-        """Delay after the arming step [steps] with the highest mean return when every episode hands over after it."""
-        delays = np.arange(self.table.horizon + 1)
+        """Delay after the arming step [steps] with the highest mean return when every episode hands over after it.
+
+        Delays are multiples of `DELAY_STEP`, and T (never).
+        """
+        delays = np.append(np.arange(0, self.table.horizon, DELAY_STEP), self.table.horizon)
         handover = self.executed(np.minimum(self.arming_step + delays[:, None], self.table.horizon))
-        return int(np.argmax(self.returns(handover, phi).mean(axis=1)))
+        return int(delays[np.argmax(self.returns(handover, phi).mean(axis=1))])
 
 
 @dataclass(frozen=True)

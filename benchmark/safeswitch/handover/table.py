@@ -8,8 +8,8 @@ agrees with plain episodes to the last bit.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,9 +17,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from safeswitch.handover.episode import NeverSwitch, continue_with_expert, run_episode
+from safeswitch.files import load_arrays, save_arrays
+from safeswitch.handover.episode import NeverSwitch, run_episode
+from safeswitch.handover.outcomes import UNKNOWN, Continuation, Outcomes
 from safeswitch.protocols import Array, Expert, Learner, Signal
-from safeswitch.store import load_arrays, save_arrays
 
 if TYPE_CHECKING:
     from safeswitch.tasks.base import TaskEnv
@@ -30,7 +31,7 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class HandoverTable:
-    """Learner-only trajectories of E episodes of one (cell, learner) and the outcome of every handover step.
+    """Learner-only trajectories of E episodes of one learner, and the outcome of every handover step.
 
     Attributes:
         seeds: (E,) episode seeds.
@@ -38,7 +39,10 @@ class HandoverTable:
         length: (E,) steps of the learner-only episode; < T after an early failure.
         learner_success: (E,) whether the learner alone succeeds.
         signals: signal id -> (E, T), NaN after an early end.
-        outcome: (E, T + 1) o(s); the columns from `length` on hold `learner_success` (there is no handover).
+        sources: outcomes of the tables that this one was put together from; shared, so that nothing is computed twice.
+        source: (E,) index into `sources`.
+        row: (E,) the episode's row in its source.
+        snapshots: (E, T + 1, ns), kept where a simulator is to resolve unknown outcomes.
     """
 
     seeds: Ints
@@ -46,7 +50,10 @@ class HandoverTable:
     length: Ints
     learner_success: Bools
     signals: Mapping[str, Array]
-    outcome: Bools
+    sources: tuple[Outcomes, ...]
+    source: Ints
+    row: Ints
+    snapshots: Array | None = field(default=None, repr=False)
 
     def __len__(self) -> int:
         return len(self.seeds)
@@ -54,22 +61,46 @@ class HandoverTable:
     @property
     def horizon(self) -> int:
         """Full length T in steps."""
-        return self.outcome.shape[1] - 1
+        return self.sources[0].known.shape[1] - 1
 
     @property
     def disturbed(self) -> Bools:
         """(E,) whether the episode has an onset."""
         return self.onset >= 0
 
+    def outcome(self, episodes: NDArray[np.integer], steps: NDArray[np.integer]) -> Bools:
+        """o(s) for arrays of episodes and handover steps that broadcast; s = T: the learner alone."""
+        episodes, steps = np.broadcast_arrays(episodes, steps)
+        success = self.learner_success[episodes]
+        open_ = steps < self.length[episodes]
+        for index, outcomes in enumerate(self.sources):
+            here = open_ & (self.source[episodes] == index)
+            success[here] = outcomes(self.row[episodes[here]], steps[here])
+        return success
+
+    def complete(self) -> HandoverTable:
+        """Compute every outcome that is not known yet."""
+        self.outcome(np.arange(len(self))[:, None], np.arange(self.horizon + 1)[None, :])
+        return self
+
+    def known(self) -> NDArray[np.int8]:
+        """(E, T + 1) what is known: 1 success, 0 failure, -1 not computed; the learner alone from `length` on."""
+        known = np.stack([self.sources[source].known[row] for source, row in zip(self.source, self.row, strict=True)])
+        ended = np.arange(self.horizon + 1)[None, :] >= self.length[:, None]
+        return np.where(ended, self.learner_success[:, None], known).astype(np.int8)
+
     def take(self, index: NDArray[np.integer] | Bools) -> HandoverTable:
         """The table of the chosen episodes, in the order of `index`."""
-        return HandoverTable(
-            self.seeds[index],
-            self.onset[index],
-            self.length[index],
-            self.learner_success[index],
-            {name: trace[index] for name, trace in self.signals.items()},
-            self.outcome[index],
+        return replace(
+            self,
+            seeds=self.seeds[index],
+            onset=self.onset[index],
+            length=self.length[index],
+            learner_success=self.learner_success[index],
+            signals={name: trace[index] for name, trace in self.signals.items()},
+            source=self.source[index],
+            row=self.row[index],
+            snapshots=None,
         )
 
     def with_signal(self, name: str, trace: Array) -> HandoverTable:
@@ -79,102 +110,133 @@ class HandoverTable:
     @cached_property
     def t_first(self) -> Array:
         """(E,) `t*_first`: last s with o = 1 on all of [t0, s]; NaN without such s, T if the learner alone succeeds."""
-        good = self.outcome[:, :-1] | self._before_onset
-        count = np.where(good.all(axis=1), self.horizon, np.argmin(good, axis=1))
-        last = np.minimum(count, self.length) - 1
-        return self._recoverable(np.where(last >= self.onset, last, -1))
+        return np.array([self._first(episode) for episode in range(len(self))])
 
     @cached_property
     def t_last(self) -> Array:
         """(E,) `t*_last`: largest s >= t0 with o(s) = 1; NaN if there is none, T if the learner alone succeeds."""
-        steps = np.arange(self.horizon)
-        good = self.outcome[:, :-1] & ~self._before_onset & (steps < self.length[:, None])
-        return self._recoverable(np.where(good, steps, -1).max(axis=1))
+        return np.array([self._last(episode) for episode in range(len(self))])
 
-    @property
-    def _before_onset(self) -> Bools:
-        return np.arange(self.horizon)[None, :] < self.onset[:, None]
+    def _first(self, episode: int) -> float:
+        onset, length = int(self.onset[episode]), int(self.length[episode])
+        if onset < 0 or self.learner_success[episode]:
+            return np.nan if onset < 0 else float(self.horizon)
+        bad = (step for step in range(onset, length) if not self._single(episode, step))
+        last = next(bad, length) - 1
+        return float(last) if last >= onset else np.nan
 
-    def _recoverable(self, last: Ints) -> Array:
-        value = np.where(last >= 0, last, np.nan).astype(float)
-        value[self.learner_success] = self.horizon
-        value[~self.disturbed] = np.nan
-        return value
+    def _last(self, episode: int) -> float:
+        onset, length = int(self.onset[episode]), int(self.length[episode])
+        if onset < 0 or self.learner_success[episode]:
+            return np.nan if onset < 0 else float(self.horizon)
+        return float(next((step for step in range(length - 1, onset - 1, -1) if self._single(episode, step)), np.nan))
 
-    def save(self, path: Path) -> None:
-        """Write as .npz without pickle."""
-        names = list(self.signals)
-        arrays = {f"signal:{name}": self.signals[name] for name in names}
+    def _single(self, episode: int, step: int) -> bool:
+        return bool(self.outcome(np.array([episode]), np.array([step]))[0])
+
+    def attach(self, env: TaskEnv, expert: Expert) -> HandoverTable:
+        """Give the table a simulator, of its cell, that resolves unknown outcomes."""
+        if self.snapshots is None or len(self.sources) != 1:
+            raise ValueError("only a table as it was recorded or loaded, with its snapshots, can be given a simulator")
+        self.sources[0].resolve = Continuation(env, expert, self.seeds, self.snapshots)
+        return self
+
+    def save(self, path: Path, snapshots: bool = True) -> None:
+        """Write as .npz without pickle; without snapshots it holds only the outcomes that are known by now."""
         save_arrays(
             path,
+            compress=True,
             seeds=self.seeds,
             onset=self.onset,
             length=self.length,
             learner_success=self.learner_success,
-            outcome=np.packbits(self.outcome, axis=1),
-            horizon=np.array(self.horizon),
-            **arrays,
+            outcome=self.known(),
+            **({"snapshots": self.snapshots} if snapshots and self.snapshots is not None else {}),
+            **{f"signal:{name}": trace for name, trace in self.signals.items()},
         )
 
     @staticmethod
     def load(path: Path) -> HandoverTable:
         """Read what `save` wrote."""
         arrays = load_arrays(path)
-        horizon = int(arrays["horizon"])
-        outcome = np.unpackbits(arrays["outcome"], axis=1, count=horizon + 1).astype(bool)
-        signals = {key.removeprefix("signal:"): value for key, value in arrays.items() if key.startswith("signal:")}
-        return HandoverTable(
-            arrays["seeds"], arrays["onset"], arrays["length"], arrays["learner_success"].astype(bool), signals, outcome
+        return new_table(
+            arrays["seeds"],
+            arrays["onset"],
+            arrays["length"],
+            arrays["learner_success"],
+            {key.removeprefix("signal:"): value for key, value in arrays.items() if key.startswith("signal:")},
+            arrays["outcome"],
+            arrays.get("snapshots"),
         )
 
 
+def new_table(
+    seeds: Ints,
+    onset: Ints,
+    length: Ints,
+    learner_success: Bools,
+    signals: Mapping[str, Array],
+    outcome: NDArray[np.int8],
+    snapshots: Array | None = None,
+) -> HandoverTable:
+    """A table with outcomes of its own, (E, T + 1): 1, 0 or -1 (unknown)."""
+    count = len(seeds)
+    source, row = np.zeros(count, np.int64), np.arange(count)
+    outcomes = (Outcomes(np.array(outcome, np.int8)),)
+    return HandoverTable(seeds, onset, length, learner_success, signals, outcomes, source, row, snapshots)
+
+
+def join_chunks(tables: Sequence[HandoverTable]) -> HandoverTable:
+    """Chunks of one cell as one recorded table, snapshots included."""
+    stacked = concatenate(tables)
+    snapshots = [table.snapshots for table in tables if table.snapshots is not None]
+    return new_table(
+        stacked.seeds,
+        stacked.onset,
+        stacked.length,
+        stacked.learner_success,
+        stacked.signals,
+        stacked.known(),
+        np.concatenate(snapshots) if len(snapshots) == len(tables) else None,
+    )
+
+
 def concatenate(tables: Sequence[HandoverTable]) -> HandoverTable:
-    """One table of all episodes, for example the disturbed episodes and their undisturbed twins."""
+    """One table of all episodes, for example the disturbed ones and their undisturbed twins; outcomes stay shared."""
     if not tables:
         raise ValueError("no tables to concatenate")
     names = set(tables[0].signals)
     for table in tables[1:]:
         if set(table.signals) != names:
             raise ValueError(f"tables hold different signals: {sorted(names)} and {sorted(table.signals)}")
+    offsets = np.cumsum([0, *(len(table.sources) for table in tables)])
     return HandoverTable(
         np.concatenate([table.seeds for table in tables]),
         np.concatenate([table.onset for table in tables]),
         np.concatenate([table.length for table in tables]),
         np.concatenate([table.learner_success for table in tables]),
         {name: np.concatenate([table.signals[name] for table in tables]) for name in tables[0].signals},
-        np.concatenate([table.outcome for table in tables]),
+        tuple(outcomes for table in tables for outcomes in table.sources),
+        np.concatenate([table.source + offset for table, offset in zip(tables, offsets, strict=False)]),
+        np.concatenate([table.row for table in tables]),
     )
 
 
 def record_table(
-    env: TaskEnv,
-    learner: Learner,
-    signals: Sequence[Signal],
-    expert: Expert,
-    seeds: Sequence[int],
-    on_episode: Callable[[], None] = lambda: None,
+    env: TaskEnv, learner: Learner, signals: Sequence[Signal], expert: Expert, seeds: Sequence[int]
 ) -> HandoverTable:
-    """Run the learner alone on each seed and then the expert from every step of each trajectory.
-
-    The expert needs neither network nor observation, so the T continuations of an episode cost far less than T
-    episodes.
-    """
-    rows = []
-    for seed in seeds:
-        episode = run_episode(env, learner, signals, NeverSwitch(), None, seed, record_snapshots=True)
-        assert episode.snapshots is not None
-        outcome = np.full(env.horizon + 1, episode.success)
-        env.reset(seed=seed)
-        for step in range(episode.length):
-            env.restore(episode.snapshots[step])
-            outcome[step] = continue_with_expert(env, expert)
-        rows.append((episode, outcome))
-        on_episode()
-    return HandoverTable(
-        np.array([episode.seed for episode, _ in rows], np.int64),
-        np.array([episode.onset for episode, _ in rows], np.int64),
-        np.array([episode.length for episode, _ in rows], np.int64),
-        np.array([episode.success for episode, _ in rows], bool),
-        {signal.id: np.stack([episode.signals[signal.id] for episode, _ in rows]) for signal in signals},
-        np.stack([outcome for _, outcome in rows]),
+    """Run the learner alone on each seed; the outcomes are computed when they are asked for."""
+    episodes = [
+        run_episode(env, learner, signals, NeverSwitch(), None, seed, record_snapshots=True) for seed in seeds
+    ]
+    snapshots = np.stack([episode.snapshots for episode in episodes if episode.snapshots is not None])
+    table = new_table(
+        np.array([episode.seed for episode in episodes], np.int64),
+        np.array([episode.onset for episode in episodes], np.int64),
+        np.array([episode.length for episode in episodes], np.int64),
+        np.array([episode.success for episode in episodes], bool),
+        {signal.id: np.stack([episode.signals[signal.id] for episode in episodes]) for signal in signals},
+        np.full((len(episodes), env.horizon + 1), UNKNOWN, np.int8),
+        snapshots,
     )
+    return table.attach(env, expert)

@@ -90,9 +90,10 @@ def cells(frame: pd.DataFrame) -> Iterator[tuple[tuple[Any, ...], pd.DataFrame]]
 
 def paired_episodes(cell: tuple[Any, ...], rows: pd.DataFrame, horizon: int) -> Iterator[PairedEpisodes]:
     """Group the methods of a cell by the episodes they ran on (usually one group: all ran on the same)."""
-    by_entry = rows.groupby(row_key(rows)[len(CELL) :], sort=True, dropna=False)
-    entries = [entry if isinstance(entry, tuple) else (entry,) for entry in by_entry.groups]
-    column = by_entry.ngroup().to_numpy()
+    key = rows[row_key(rows)[len(CELL) :]]
+    first = (key != key.shift()).any(axis=1)  # prepared episodes are sorted by method
+    entries: list[Entry] = list(key[first].itertuples(index=False, name=None))
+    column = first.cumsum().to_numpy() - 1
     units, unit = np.unique(rows[EPISODE].to_numpy(dtype=np.int64), axis=0, return_inverse=True)
     unit = unit.reshape(-1)
     armed = np.full((len(units), len(entries)), np.nan)

@@ -121,8 +121,8 @@ def _skill(group: PairedEpisodes, entry: tuple[Any, ...], mean: Array, means: Ar
     nothing = dict.fromkeys(("skill", "skill_lo", "skill_hi", "contest_gap", "contest_share"), float("nan"))
     signal = signal_of(entry[0])
     best = group.find(f"best@{signal}", entry) if signal else None
-    references = [group.find(name, entry) for name in REFERENCES]
-    if best is None or None in references:
+    references = [index for name in REFERENCES if (index := group.find(name, entry)) is not None]
+    if best is None or len(references) < len(REFERENCES):
         return nothing
     zero, zeros = mean[references].max(), means[:, references].max(axis=1)
     gap, gaps = float(mean[best] - zero), means[:, best] - zeros
@@ -167,7 +167,7 @@ def write_csv(frame: pd.DataFrame, path: Path) -> Path:
 
 def read_csv(path: Path) -> pd.DataFrame:
     """Read a table of `write_csv`; writing it again gives the same bytes."""
-    return pd.read_csv(path, float_precision="round_trip", keep_default_na=False, na_values=[""])
+    return pd.read_csv(path, keep_default_na=False, na_values=[""])
 
 
 def merge_task_rows(old: Path | pd.DataFrame | None, new: pd.DataFrame) -> pd.DataFrame:

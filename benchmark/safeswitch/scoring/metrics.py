@@ -84,6 +84,8 @@ def prepare(episodes: pd.DataFrame, infos: Mapping[str, TaskInfo]) -> pd.DataFra
     frame[BOOLEANS] = frame[BOOLEANS].astype(bool)
     for name in ("t_first", "t_last", "threshold"):
         frame[name] = frame[name].astype(float)
+    if "calibrated_on" in frame:
+        frame["calibrated_on"] = frame["calibrated_on"].fillna("")
     for task in frame["task"].unique():
         if task not in infos:
             raise unknown("task", task, infos)
@@ -91,7 +93,8 @@ def prepare(episodes: pd.DataFrame, infos: Mapping[str, TaskInfo]) -> pd.DataFra
         if protocol not in ARMINGS:
             raise unknown("protocol", protocol, ARMINGS)
     order = row_key(frame) + EPISODE
-    frame = frame.sort_values(order, kind="stable", ignore_index=True)
+    codes = [pd.factorize(frame[name], sort=True)[0] for name in order]  # far quicker than sorting rows of strings
+    frame = frame.iloc[np.lexsort(codes[::-1])].reset_index(drop=True)
     _check_ranges(frame, infos)
     _check_pairs(frame, order)
     return frame

@@ -1,18 +1,15 @@
-"""`TaskEnv`: what all tasks share: the clock, the disturbance, snapshots, and Gymnasium's conventions.
+"""`TaskEnv`, what all tasks share: the clock, the disturbance, snapshots, and Gymnasium's conventions.
 
 An episode is a function of its seed. Three named streams feed it, `initial-state`, `onset` and `disturbance`, so the
 undisturbed twin (same seed, ``disturbance=None``) starts in the same state and is identical until the onset step t0.
 
-Each environment owns two copies of the model: the nominal one, and the disturbed one that takes over before the
-observation of step t0. Which of them is in force is a function of the step index alone, and MuJoCo's state is never
-touched by a disturbance; therefore `restore` needs no memory of what happened.
+The disturbance sets in before the observation of step t0: from there on the simulator steps with its disturbed model.
+Which model is in force is a function of the step index alone; therefore `restore` needs no memory of what happened.
 """
 
 from __future__ import annotations
 
-import copy
 import math
-from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, SupportsFloat
 
@@ -21,21 +18,17 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safeswitch.names import unknown
 from safeswitch.protocols import Expert
 from safeswitch.seeding import stream
+from safeswitch.tasks import checks
 from safeswitch.tasks.disturbances import Disturbance, make_disturbance
 from safeswitch.tasks.rendering import Image, Renderer
+from safeswitch.tasks.simulator import Simulator
 
 Array = NDArray[np.float64]
 
-STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION.value)
-"""Everything from which MuJoCo computes the next step: positions, velocities, controls, forces, warm start, time."""
-
 HEADER = 4
 """Leading numbers of a snapshot: episode seed, step index, consecutive good states, terminated."""
-
-RESET_OPTIONS = ("initial_state", "onset")
 
 
 class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
@@ -81,7 +74,7 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
         self._arguments = dict(arguments)
         self.horizon, self.control_dt, self.success_steps = horizon, control_dt, success_steps
         self._onset_range = onset_range
-        self.render_mode = check_render_mode(arguments["render_mode"], self.metadata["render_modes"])
+        self.render_mode = checks.check_render_mode(arguments["render_mode"], self.metadata["render_modes"])
         self.metadata = {**self.metadata, "render_fps": round(1.0 / control_dt)}
         self.width, self.height = int(arguments["width"]), int(arguments["height"])
 
@@ -89,12 +82,7 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
         self.disturbance: Disturbance | None = (
             None if name is None else make_disturbance(name, arguments["severity"], self.task)
         )
-        self._nominal = copy.deepcopy(model)
-        self._disturbed = self._nominal if self.disturbance is None else copy.deepcopy(model)
-        self._model = self._nominal
-        self._data = mujoco.MjData(self._nominal)
-        self._ctrl, self._qfrc_applied = self._data.ctrl, self._data.qfrc_applied
-        self._substeps = count_substeps(control_dt, model.opt.timestep)
+        self.simulator = Simulator(model, control_dt, disturbance=self.disturbance is not None)
         self._renderer: Renderer | None = None
 
         self._episode_seed: int | None = None
@@ -102,46 +90,38 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
         self._onset: int | None = None
         self._step_index = self._good_steps = 0
         self._terminated = False
-        self._nominal_parameters = self._disturbed_parameters = self._read_parameters(self._nominal)
+        self._nominal_parameters = self._disturbed_parameters = self._read_parameters(model)
 
     # -------------------------------------------------------------------------------------------- filled in by a task
 
-    @abstractmethod
     def _draw_initial_state(self, rng: np.random.Generator) -> Array:
         """Initial full state (nx,) [SI units]."""
         raise NotImplementedError
 
-    @abstractmethod
     def _write_state(self, state: Array) -> None:
         """Put the full state (nx,) into the simulator."""
         raise NotImplementedError
 
-    @abstractmethod
     def _read_state(self) -> Array:
         """Full state (nx,) of the simulator [SI units]."""
         raise NotImplementedError
 
-    @abstractmethod
     def _read_parameters(self, model: mujoco.MjModel) -> Array:
         """Model parameters (np,) as the physics uses them, read from `model`."""
         raise NotImplementedError
 
-    @abstractmethod
     def _judge(self) -> tuple[bool, bool]:
         """(good, failed) of the current state: good ones add up to a success, a failed one ends the episode."""
         raise NotImplementedError
 
-    @abstractmethod
     def _reward(self) -> float:
         """Reward of the current state."""
         raise NotImplementedError
 
-    @abstractmethod
     def _observe(self, disturbance: Disturbance | None) -> NDArray[Any]:
         """Observation of the current state under the `disturbance` in force (None: as in the undisturbed task)."""
         raise NotImplementedError
 
-    @abstractmethod
     def make_expert(self) -> Expert:
         """The model-predictive expert of this task."""
         raise NotImplementedError
@@ -161,16 +141,19 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
             Observation and info of step 0.
         """
         super().reset(seed=seed)
-        options = check_options(options)
+        options = checks.check_options(options)
         self._episode_seed = int(self.np_random.integers(2**31)) if seed is None else int(seed)
         self._options = options
-        mujoco.mj_resetData(self._nominal, self._data)
-        self._write_state(self._initial_state(self._episode_seed, options.get("initial_state")))
+        self.simulator.reset()
+        state = self._draw_initial_state(stream(self._episode_seed, "initial-state"))
+        if "initial_state" in options:
+            state = checks.check_state(options["initial_state"], state.shape)
+        self._write_state(state)
         self._step_index = self._good_steps = 0
         self._prepare_disturbance(self._episode_seed, options.get("onset"))
         good, self._terminated = self._judge()
         self._good_steps = int(good)
-        self._choose_model()
+        self.simulator.choose(self.disturbed)
         return self.observe(), self._info()
 
     def step(self, action: NDArray[Any]) -> tuple[NDArray[Any], SupportsFloat, bool, bool, dict[str, Any]]:
@@ -194,18 +177,16 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
             RuntimeError: the episode has not begun or is over.
         """
         command = np.asarray(action, dtype=np.float64)
-        if command.shape != self._ctrl.shape or not math.isfinite(command.sum()):
-            raise invalid_action(action, self._ctrl.shape)
+        if command.shape != self.simulator.action_shape or not math.isfinite(command.sum()):
+            raise checks.invalid_action(action, self.simulator.action_shape)
         if self._episode_seed is None or self.done:
-            raise RuntimeError("the episode has not begun or is over: call reset() first")
-        np.clip(command, -1.0, 1.0, out=self._ctrl)
-        self._apply_force()
-        mujoco.mj_step(self._model, self._data, nstep=self._substeps)
+            raise checks.not_running(self._episode_seed is not None, self._step_index, self._terminated)
+        self.simulator.advance(command, self._force())
         self._step_index += 1
         good, self._terminated = self._judge()
         self._good_steps = self._good_steps + 1 if good else 0
         if self._step_index == self._onset:
-            self._choose_model()
+            self.simulator.choose(True)
 
     def observe(self, clean: bool = False) -> NDArray[Any]:
         """Observation of the current step; `clean=True` gives the same state without the disturbance."""
@@ -217,9 +198,9 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
             gym.logger.warn("render() needs a render mode: gym.make(id, render_mode='rgb_array')")
             return None
         if self._renderer is None:
-            self._renderer = Renderer(self._nominal, self.width, self.height, self.camera)
-        self._update_kinematics(self._model)
-        return self._renderer.render(self._model, self._data)
+            self._renderer = Renderer(self.simulator.nominal, self.width, self.height, self.camera)
+        self.simulator.update_kinematics(self.simulator.model)
+        return self._renderer.render(self.simulator.model, self.simulator.data)
 
     def close(self) -> None:
         """Free the renderer; the physics keeps working and `render` makes a new one."""
@@ -274,16 +255,16 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
     @property
     def parameters(self) -> Array:
         """Model parameters (np,) that the physics uses now; they change at the onset of a disturbance of them."""
-        return (self._disturbed_parameters if self._model is self._disturbed else self._nominal_parameters).copy()
+        return (self._disturbed_parameters if self.disturbed else self._nominal_parameters).copy()
 
     # ----------------------------------------------------------------------------------------------------- snapshots
 
     def snapshot(self) -> Array:
         """Everything that the rest of the episode depends on, besides its seed and options, as one vector."""
-        state = np.empty(HEADER + mujoco.mj_stateSize(self._nominal, STATE))
-        state[:HEADER] = (self._seed_key(), self._step_index, self._good_steps, self._terminated)
-        mujoco.mj_getState(self._nominal, self._data, state[HEADER:], STATE)
-        return state
+        snapshot = np.empty(HEADER + self.simulator.state_size)
+        snapshot[:HEADER] = (self._seed_key(), self._step_index, self._good_steps, self._terminated)
+        self.simulator.read(snapshot[HEADER:])
+        return snapshot
 
     def restore(self, snapshot: Array) -> None:
         """Go back, or forward, to a snapshot of the same episode; it continues bit for bit.
@@ -295,7 +276,7 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
         Raises:
             ValueError: the snapshot belongs to another task or episode.
         """
-        size = HEADER + mujoco.mj_stateSize(self._nominal, STATE)
+        size = HEADER + self.simulator.state_size
         if snapshot.shape != (size,):
             raise ValueError(f"a snapshot of {self.task} has shape ({size},), got {snapshot.shape}")
         if self._episode_seed is None or snapshot[0] != self._seed_key():
@@ -305,8 +286,8 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
             )
         self._step_index, self._good_steps = int(snapshot[1]), int(snapshot[2])
         self._terminated = bool(snapshot[3])
-        mujoco.mj_setState(self._nominal, self._data, np.ascontiguousarray(snapshot[HEADER:], np.float64), STATE)
-        self._choose_model()
+        self.simulator.write(snapshot[HEADER:])
+        self.simulator.choose(self.disturbed)
 
     def __getstate__(self) -> dict[str, Any]:
         """Arguments, generator and snapshot: a pickled environment continues its episode, without the simulator."""
@@ -330,53 +311,27 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
 
     # ------------------------------------------------------------------------------------------------------- helpers
 
-    def _initial_state(self, seed: int, given: Any) -> Array:
-        """The state `given`, checked, or the one that the seed draws."""
-        drawn = self._draw_initial_state(stream(seed, "initial-state"))
-        if given is None:
-            return drawn
-        state = np.asarray(given, dtype=np.float64)
-        if state.shape != drawn.shape or not np.isfinite(state).all():
-            raise ValueError(f"initial_state must be {drawn.shape} finite numbers, got {given!r}")
-        return state
-
     def _prepare_disturbance(self, seed: int, given_onset: int | None) -> None:
         """Draw onset and disturbance, and write the model that takes over at the onset."""
         if self.disturbance is None:
             self._onset = None
             return
-        self._onset = self._draw_onset(stream(seed, "onset")) if given_onset is None else int(given_onset)
-        if not 0 <= self._onset < self.horizon:
-            raise ValueError(f"the onset must be a step from 0 to {self.horizon - 1}, got {self._onset}")
+        drawn = self._draw_onset(stream(seed, "onset"))
+        self._onset = drawn if given_onset is None else checks.check_onset(given_onset, self.horizon)
         self.disturbance.reset(stream(seed, "disturbance"), self.horizon)
-        self.disturbance.alter(self._nominal, self._disturbed)
-        if self.disturbance.changes_inertia:
-            # In scratch data: it evaluates the reference pose, and the state of the episode is none of its business.
-            mujoco.mj_setConst(self._disturbed, mujoco.MjData(self._disturbed))
-        self._disturbed_parameters = self._read_parameters(self._disturbed)
+        self.simulator.disturb(self.disturbance)
+        self._disturbed_parameters = self._read_parameters(self.simulator.disturbed)
 
     def _draw_onset(self, rng: np.random.Generator) -> int:
         """Uniform in the onset range, both ends included."""
         low, high = (round(share * self.horizon) for share in self._onset_range)
         return int(rng.integers(low, high, endpoint=True))
 
-    def _choose_model(self) -> None:
-        """Put the model that belongs to the current step in force."""
-        self._model = self._disturbed if self.disturbed else self._nominal
-
-    def _apply_force(self) -> None:
-        """Set the generalised force of the disturbance for the coming step."""
+    def _force(self) -> Array | None:
+        """Generalised force (nv,) of the disturbance during the coming step; None for none."""
         if self.disturbance is None or self._onset is None or self._step_index < self._onset:
-            return
-        force = self.disturbance.force(self._step_index - self._onset)
-        if force is not None:
-            self._qfrc_applied[:] = force
-
-    def _update_kinematics(self, model: mujoco.MjModel) -> None:
-        """Bring the geometry up to date with the state; unlike `mj_forward` this leaves the state untouched."""
-        mujoco.mj_kinematics(model, self._data)
-        mujoco.mj_comPos(model, self._data)
-        mujoco.mj_camlight(model, self._data)
+            return None
+        return self.disturbance.force(self._step_index - self._onset)
 
     def _info(self) -> dict[str, Any]:
         """The same keys at reset and at every step."""
@@ -392,34 +347,3 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
     def _seed_key(self) -> float:
         """The episode seed as it stands in a snapshot (a float holds integers up to 2^53)."""
         return float(self.episode_seed % 2**53)
-
-
-def count_substeps(control_dt: float, timestep: float) -> int:
-    """Simulator steps in a control step."""
-    substeps = round(control_dt / timestep)
-    if substeps < 1 or not math.isclose(substeps * timestep, control_dt, rel_tol=1e-9):
-        raise ValueError(f"control_dt must be a multiple of the time step {timestep} s, got {control_dt} s")
-    return substeps
-
-
-def check_render_mode(mode: str | None, valid: Sequence[str]) -> str | None:
-    """`mode` if it is None or one of the `valid` ones, else a ValueError."""
-    if mode is not None and mode not in valid:
-        raise unknown("render_mode", mode, valid)
-    return mode
-
-
-def check_options(options: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Reset options without unknown names."""
-    for name in options or ():
-        if name not in RESET_OPTIONS:
-            raise unknown("reset option", name, RESET_OPTIONS)
-    return dict(options or {})
-
-
-def invalid_action(action: Any, shape: tuple[int, ...]) -> ValueError:
-    """Error that says what is wrong with an action."""
-    array = np.asarray(action, dtype=np.float64)
-    if array.shape != shape:
-        return ValueError(f"an action has shape {shape}, got {array.shape}: {action!r}")
-    return ValueError(f"an action must be finite, got {action!r}")

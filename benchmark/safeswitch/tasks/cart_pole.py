@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, fields
-from typing import Any
 
 import gymnasium as gym
 import mujoco
@@ -72,7 +71,6 @@ class CartPoleConfig:
         control_dt: control period [s], a multiple of `timestep`.
         timestep: time step of the simulation [s].
         horizon: T, control steps of an episode.
-        gravity: [m/s^2].
         rail: half the length of the rail [m].
         force_limit: force on the cart at action 1 [N].
         cart_mass: [kg].
@@ -92,7 +90,6 @@ class CartPoleConfig:
     control_dt: float = CONTROL_DT
     timestep: float = TIMESTEP
     horizon: int = HORIZON
-    gravity: float = 9.81
     rail: float = RAIL
     force_limit: float = FORCE_LIMIT
     cart_mass: float = CART_MASS
@@ -110,7 +107,7 @@ class CartPoleConfig:
 
     def __post_init__(self) -> None:
         """Refuse numbers that make no cart-pole."""
-        may_be_zero = ("gravity", "cart_damping", "pole_damping", "onset_low", "onset_high")
+        may_be_zero = ("cart_damping", "pole_damping", "onset_low", "onset_high")
         for name, value in asdict(self).items():
             lowest = 0.0 if name in may_be_zero or name.startswith("spread") else np.nextafter(0.0, 1.0)
             if not (math.isfinite(value) and value >= lowest):
@@ -175,11 +172,14 @@ class CartPoleEnv(TaskEnv):
     | key | type | meaning |
     |---|---|---|
     | `state` | float64 (4,) | [x, x_dot, theta, theta_dot], undisturbed, theta not wrapped |
-    | `parameters` | float64 (7,) | cart_mass [kg], pole_mass [kg], pole_length [m], pole_inertia [kg m^2], cart_damping [N s/m], pole_damping [N m s/rad], force_limit [N], as the physics uses them now |
+    | `parameters` | float64 (7,) | `parameter_names`, as the physics uses them now: see below |
     | `is_success` | bool | the success criterion, evaluated now |
     | `disturbed` | bool | whether the onset has passed |
     | `step` | int | control steps executed |
     | `onset` | int | t0, -1 in an undisturbed episode |
+
+    Parameters: cart_mass M [kg], pole_mass m [kg], pole_length l [m], pole_inertia I [kg m^2], cart_damping b [N s/m],
+    pole_damping c [N m s/rad], force_limit [N].
 
     ## Arguments
 
@@ -230,7 +230,7 @@ class CartPoleEnv(TaskEnv):
             success_steps=math.ceil(round(SUCCESS_SECONDS / self.config.control_dt, 9)),
             onset_range=(self.config.onset_low, self.config.onset_high),
         )
-        self._qpos, self._qvel = self._data.qpos, self._data.qvel
+        self._qpos, self._qvel = self.simulator.data.qpos, self.simulator.data.qvel
         high = np.array([1.5 * self.config.rail, VELOCITY_BOUND, math.pi, SPIN_BOUND], np.float32)
         self._high = high.astype(np.float64)
         self.observation_space = gym.spaces.Box(-high, high, dtype=np.float32)

@@ -131,6 +131,7 @@ class CartMass(Disturbance):
     changes_inertia = True
 
     def alter(self, nominal: mujoco.MjModel, model: mujoco.MjModel) -> None:
+        """Scale the mass of the cart."""
         scale_mass(nominal, model, "cart", self.value)
 
 
@@ -146,6 +147,7 @@ class PoleLength(Disturbance):
     changes_inertia = True
 
     def alter(self, nominal: mujoco.MjModel, model: mujoco.MjModel) -> None:
+        """Move the centre of mass, and shorten the rod that is drawn."""
         body = nominal.body("pole").id
         model.body_ipos[body] = self.value * nominal.body_ipos[body]
         rod, bob = nominal.geom("pole").id, nominal.geom("bob").id
@@ -166,6 +168,7 @@ class JointFriction(Disturbance):
     HINGE_SHARE: ClassVar[float] = 1.0 / 200.0
 
     def alter(self, nominal: mujoco.MjModel, model: mujoco.MjModel) -> None:
+        """Add viscous friction to both joints."""
         for joint, added in (("slide", self.value), ("hinge", self.HINGE_SHARE * self.value)):
             dof = int(nominal.joint(joint).dofadr[0])
             model.dof_damping[dof] = nominal.dof_damping[dof] + added
@@ -183,11 +186,13 @@ class Push(Disturbance):
     STEPS: ClassVar[int] = 3
 
     def reset(self, rng: np.random.Generator, horizon: int) -> None:
+        """Draw the direction."""
         sign = rng.choice((-1.0, 1.0))
         self._push = np.array([sign * self.value, 0.0])
         self._rest = np.zeros(2)
 
     def force(self, elapsed: int) -> Array | None:
+        """The push on the slide joint [N], nothing on the hinge; zeros afterwards, to end it."""
         return self._push if 0 <= elapsed < self.STEPS else self._rest
 
 
@@ -205,6 +210,7 @@ class MotorGain(Disturbance):
     sentence = "the force of a given action is multiplied by {:g}"
 
     def alter(self, nominal: mujoco.MjModel, model: mujoco.MjModel) -> None:
+        """Scale the gear of the motor."""
         motor = nominal.actuator("force").id
         model.actuator_gear[motor] = self.value * nominal.actuator_gear[motor]
 
@@ -224,9 +230,11 @@ class SensorBias(Disturbance):
     ANGLE: ClassVar[int] = 2
 
     def reset(self, rng: np.random.Generator, horizon: int) -> None:
+        """Draw the sign."""
         self._bias = self.value * float(rng.choice((-1.0, 1.0)))
 
     def sense(self, observation: Array, step: int) -> Array:
+        """Add the bias to the angle."""
         observation = observation.copy()
         observation[self.ANGLE] += self._bias
         return observation
@@ -244,9 +252,11 @@ class SensorNoise(Disturbance):
     SCALE: ClassVar[Array] = np.array([0.5, 2.0, 1.0, 4.0])
 
     def reset(self, rng: np.random.Generator, horizon: int) -> None:
+        """Draw the noise of every step."""
         self._noise = self.value * self.SCALE * rng.standard_normal((horizon + 1, self.SCALE.size))
 
     def sense(self, observation: Array, step: int) -> Array:
+        """Add the noise of this step."""
         return observation + self._noise[step]
 
 
@@ -271,12 +281,12 @@ class Repaint(Disturbance):
     """Each gives red, green, blue of cart, pole and bob; none is close to the nominal blue, orange and red."""
 
     def reset(self, rng: np.random.Generator, horizon: int) -> None:
+        """Draw the palette."""
         self._palette = self.PALETTES[int(rng.integers(len(self.PALETTES)))]
 
     def alter(self, nominal: mujoco.MjModel, model: mujoco.MjModel) -> None:
+        """Mix the colours."""
         for name, colour in zip(("cart", "pole", "bob"), self._palette, strict=True):
             material = nominal.material(name).id
             before = nominal.mat_rgba[material, :3]
             model.mat_rgba[material, :3] = (1.0 - self.value) * before + self.value * np.array(colour)
-
-

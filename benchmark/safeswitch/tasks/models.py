@@ -55,7 +55,6 @@ def cart_pole(config: CartPoleConfig) -> mujoco.MjModel:
     """Compiled cart-pole with the numbers of `config`. Shared within the process: copy it before changing it."""
     tree = compose("cart_pole/cart_pole.xml")
     tree.option.timestep = config.timestep
-    tree.option.gravity = [0.0, 0.0, -config.gravity]
 
     tree.find("body", "cart").inertial.mass = config.cart_mass
     tree.find("joint", "slide").damping = config.cart_damping

@@ -58,7 +58,7 @@ def choose_backend() -> str:
 
 
 def probe(width: int = 32, height: int = 32) -> tuple[bool, str]:
-    """Render one really existing frame: (True, the backend) or (False, what is wrong and what to do)."""
+    """Render one small frame for real: (True, the backend) or (False, what is wrong and what to do)."""
     import mujoco
 
     xml = (
@@ -76,9 +76,9 @@ def probe(width: int = 32, height: int = 32) -> tuple[bool, str]:
     except Exception as error:  # whatever the driver throws, the answer is a message
         return False, str(error)
     backend = os.environ.get("MUJOCO_GL") or "default"
-    red, _, blue = picture[height // 2, width // 2].astype(int)
+    red, green, blue = (int(value) for value in picture[height // 2, width // 2])
     if red <= blue + 20:
-        return False, f"OpenGL ({backend}) renders wrong pixels: a red ball came out as {picture[height // 2, width // 2]}"
+        return False, f"OpenGL ({backend}) renders wrong pixels: a red ball came out as RGB {red}, {green}, {blue}"
     return True, f"OpenGL ({backend}) renders {width} x {height} frames"
 
 
