@@ -38,7 +38,7 @@ test-slow: setup ## run the slow tests: packaging, long properties, full protoco
 
 perf: ## time the expert beside crocoddyl in one run
 	@bash scripts/setup.sh dev,perf
-	$(BIN)/python -m safeswitch.expert.perf
+	$(BIN)/python -m safeswitch.perf
 
 lint: setup ## ruff and mypy
 	$(BIN)/ruff check .

@@ -40,10 +40,12 @@ double f(double x) { return sqrt(x); }' > "$folder/probe.c"
   return $status
 }
 
-# EGL as MuJoCo opens it: some device must give a display that can be initialised. libEGL alone is not enough.
+# EGL as MuJoCo opens it: some device must give a display that can be initialised, which libEGL alone does not, and
+# PyOpenGL, through which MuJoCo calls EGL, wants libOpenGL or libGL beside it.
 egl_works() {
   "$1" - <<'PROBE' >/dev/null 2>&1
 import ctypes, sys
+from ctypes.util import find_library
 egl = ctypes.CDLL("libEGL.so.1")
 pointer, count = ctypes.c_void_p, ctypes.c_int()
 egl.eglGetProcAddress.restype = pointer
@@ -54,7 +56,8 @@ egl.eglInitialize.argtypes = [pointer, pointer, pointer]
 devices = (pointer * 16)()
 query(16, devices, ctypes.byref(count))
 opened = (display(0x313F, device, None) for device in devices[: count.value])  # EGL_PLATFORM_DEVICE_EXT
-sys.exit(not any(each and egl.eglInitialize(each, None, None) for each in opened))
+works = any(each and egl.eglInitialize(each, None, None) for each in opened)
+sys.exit(not (works and (find_library("OpenGL") or find_library("GL"))))
 PROBE
 }
 
@@ -64,8 +67,11 @@ probe_linux() {
   fi
   if [ "${SAFESWITCH_SKIP_SYSTEM:-0}" = 1 ]; then return; fi
   if ! compiler_works; then debian+=(gcc libc6-dev); reasons+=("compiling the expert's solver"); fi
+  case "$extras" in *perf*) # crocoddyl's side of the comparison is C++
+    if ! command -v g++ >/dev/null; then debian+=(g++); reasons+=("compiling crocoddyl's model"); fi ;;
+  esac
   if [ "${MUJOCO_GL:-egl}" = egl ] && ! egl_works "$python"; then
-    debian+=(libegl1 libgl1-mesa-dri); reasons+=("rendering without a display (EGL)")
+    debian+=(libegl1 libgl1-mesa-dri libopengl0); reasons+=("rendering without a display (EGL)")
   fi
 }
 

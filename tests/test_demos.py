@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 import safeswitch
-from safeswitch import demos
-from safeswitch.demos import METADATA, Demonstrations, Noise, Rollout, collect, load, roll_out, write
+from safeswitch import datasets, demos
+from safeswitch.datasets import METADATA, write
+from safeswitch.demos import Demonstrations, Noise, Rollout, collect, load, roll_out
 
 ENV = "SafeSwitch/CartPole-v0"
 DATASET = "safeswitch/cart-pole/expert-v0"
@@ -34,7 +35,7 @@ def data(root) -> Demonstrations:
 
 @pytest.fixture(scope="module")
 def episodes(root):
-    with demos.minari_root(root):
+    with datasets.minari_root(root):
         import minari
 
         dataset = minari.load_dataset(DATASET)
@@ -106,6 +107,7 @@ def test_executed_actions_are_labels_plus_noise_within_the_bounds(episodes):
         np.testing.assert_array_equal(episode.actions, expected)
 
 
+@pytest.mark.filterwarnings("ignore:Package safeswitch is not installed")
 def test_metadata_says_what_it_is(episodes):
     metadata = episodes[1].storage.metadata
     assert metadata["algorithm_name"].startswith("MPC")
@@ -133,7 +135,7 @@ def test_an_interruption_keeps_the_older_dataset(root, tmp_path, monkeypatch):
     def fail(*arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(demos, "_move", fail)
+    monkeypatch.setattr(datasets, "_move", fail)
     with pytest.raises(KeyboardInterrupt):
         collect(ENV, DATASET, tmp_path, SEEDS[:2], noise=NOISE)
     assert load(DATASET, tmp_path).settings["seeds"] == SEEDS[:1]

@@ -80,7 +80,7 @@ def test_rendering_that_fails_names_the_debian_packages(monkeypatch: pytest.Monk
     monkeypatch.setenv("MUJOCO_GL", "no-such-backend")
     check = doctor.check_rendering()
     assert not check.ok and "MUJOCO_GL=no-such-backend" in check.detail
-    assert "apt-get install -y libegl1 libgl1-mesa-dri" in check.remedy
+    assert doctor.REMEDY in check.remedy
 
 
 def test_a_compiler_that_only_pretends_is_found_out(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -101,9 +101,9 @@ def test_margins_enclose_the_change_of_outcome() -> None:
     assert outcome_margins([0.1, 0.2], [0, 0]) == (-np.inf, 0.1)
 
 
-@pytest.mark.parametrize("margins", [(0.2, 0.5), (float("nan"), float("nan")), (-np.inf, np.inf)])
+@pytest.mark.parametrize("margins", [(float("nan"), float("nan")), (-np.inf, np.inf)])
 def test_cem_figure_takes_any_margins(margins: tuple[float, float], tmp_path: Path) -> None:
-    assert figure_cem(cem_log(), margins, 0.3, tmp_path / "a.png").stat().st_size > 10_000
+    assert figure_cem(cem_log(3, 5), margins, 0.3, tmp_path / "a.png").stat().st_size > 10_000
 
 
 def test_undisturbed_episode_without_handover(tmp_path: Path) -> None:

@@ -161,6 +161,27 @@ def test_probe_renders() -> None:
     assert works and "32 x 32" in message
 
 
+@pytest.mark.rendering
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
+def test_a_forked_child_is_told_instead_of_hanging() -> None:
+    code = (
+        "import os\nfrom safeswitch.tasks.cart_pole import CartPoleEnv\n"
+        "env = CartPoleEnv(render_mode='rgb_array'); env.reset(seed=0); before = env.render()\n"
+        "child = os.fork()\n"
+        "if child == 0:\n"
+        "    for other in (env, CartPoleEnv(render_mode='rgb_array')):\n"
+        "        other.reset(seed=0); other.advance([0.1])\n"
+        "        try:\n            other.render(); os._exit(1)\n"
+        "        except RuntimeError as error:\n            assert 'spawn' in str(error)\n"
+        "        other.close()\n"
+        "    os._exit(0)\n"
+        "assert os.waitpid(child, 0)[1] == 0\n"
+        "assert (env.render() == before).all()\n"
+    )
+    result = run(code)
+    assert result.returncode == 0, result.stderr
+
+
 def run(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
     """Run `code` in a fresh interpreter with MUJOCO_GL and the like set anew."""
     clean = {key: value for key, value in os.environ.items() if key not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}

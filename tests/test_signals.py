@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from safeswitch import registry
 from safeswitch.protocols import Prediction, Signal
 from safeswitch_baselines.signals import SIGNALS, Smoothed, Total, make_signal, split_id
 
@@ -89,6 +90,17 @@ def test_signals_of_others_are_smoothed_too():
         id = "novelty"
 
     assert make_signal("novelty-mean3", {"novelty": Novelty}).id == "novelty-mean3"
+
+
+def test_registered_signals_of_other_packages_are_found(monkeypatch):
+    class Novelty(Total):
+        id = "novelty"
+
+    monkeypatch.setattr(registry, "names", lambda kind: ["novelty", "smoothed", "total"])
+    monkeypatch.setattr(registry, "find", lambda kind, name: {"novelty": Novelty}[name])
+    assert make_signal("novelty-max2").id == "novelty-max2"
+    with pytest.raises(ValueError, match="nearest first: novelty, "):
+        make_signal("noveltie")
 
 
 @pytest.mark.parametrize(

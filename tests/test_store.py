@@ -102,7 +102,7 @@ def test_key_follows_the_bytes_of_modules_packages_and_folders(
     monkeypatch.syspath_prepend(str(tmp_path / "source"))
 
     def key() -> Key:
-        return store.key("stage", {}, code=["keyed_package", "keyed_module", model, tmp_path / "source"])
+        return Store(store.root).key("stage", {}, code=["keyed_package", "keyed_module", model, tmp_path / "source"])
 
     first = key()
     assert set(first.recipe["code"]) >= {"keyed_module", "keyed_package/part/deep.py", "model.xml"}

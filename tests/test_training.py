@@ -85,14 +85,15 @@ def test_same_seed_same_bits_whatever_the_threads():
     assert weights(train_bayesian_mlp(demos, 4, QUICK, device="cpu")) != results[0]
 
 
-def test_noise_free_labels_do_not_break_the_loss():
+@pytest.mark.parametrize("loss", ["nll", "beta-nll"])
+def test_noise_free_labels_do_not_break_the_loss(loss):
     demos = demonstrations(10)
     exact = dataclasses.replace(demos, actions=np.full_like(demos.actions, 0.25))
-    learner = train_bayesian_mlp(exact, 0, dataclasses.replace(QUICK, epochs=60))
+    learner = train_bayesian_mlp(exact, 0, dataclasses.replace(QUICK, epochs=60, loss=loss))
     assert np.isfinite(learner.history["loss"]).all()
     prediction = learner.predict(np.array([0.3, 0.0]), 0)
     assert prediction.aleatoric_var[0] >= np.exp(QUICK.log_var_bounds[0])
-    assert abs(prediction.action[0] - 0.25) < 0.05
+    assert abs(prediction.action[0] - 0.25) < 0.1
 
 
 def test_progress_reports_every_epoch_and_validation_may_be_left_out():

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from safeswitch import registry
 from safeswitch.names import nearest, unknown
 from safeswitch.protocols import Array, Prediction, Signal
 
@@ -134,15 +135,32 @@ def make_signal(signal_id: str, factories: Mapping[str, Callable[[], Signal]] | 
 
     Args:
         signal_id: for example "total" or "epistemic-max5".
-        factories: unsmoothed signals by id; None for the baselines' own.
+        factories: unsmoothed signals by id; None for the baselines' own and those that other packages register.
 
     Raises:
         ValueError: unknown signal or smoothing; the message lists the valid ones, nearest first.
     """
-    known = SIGNALS if factories is None else factories
+    known = _registered() if factories is None else factories
     if signal_id in known:
         return known[signal_id]()
     base, word, length = split_id(signal_id)
     if base not in known:
         raise unknown("signal", base, known)
     return known[base]() if word is None else Smoothed(known[base](), word, length)
+
+
+def _registered() -> dict[str, Callable[[], Signal]]:
+    """The baselines' signals and those of other packages, which are imported only when they are made."""
+    others = (name for name in registry.names("signal") if name not in SIGNALS and name != "smoothed")
+    return {**{name: _Registered(name) for name in others}, **SIGNALS}
+
+
+class _Registered:
+    """Factory of a signal that another package registers as an entry point."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __call__(self) -> Signal:
+        signal: Signal = registry.find("signal", self._name)()
+        return signal

@@ -1,7 +1,7 @@
 """READ FIRST: expert -> demonstrations -> learner -> handover tables -> switch rules -> leaderboard.
 
-`bench` runs the stages in this order, one task after the other; `stages.py` says what each stage computes,
-`suite.py` what is run. Finished work is kept in a store by the hash of everything it depends on, so that a second run
+A `Run` holds the stages of one task in this order; `stages.py` says what each computes, `suite.py` what is run, and
+`publish.py` writes the tables. Finished work is kept in a store by the hash of everything it depends on, so that a second run
 computes nothing and an interrupted one continues where it stopped.
 """
 
@@ -114,6 +114,32 @@ class Run:
         self.finish("signal quality", jobs)
         return jobs
 
+    @cached_property
+    def scores(self) -> Job:
+        """Leaderboard, signal quality and comparisons."""
+        job = publish.scores_job(self.store, self.task, self.episodes, self.signals)
+        self.finish("scores", [job])
+        return job
+
+    @cached_property
+    def spread(self) -> Job:
+        """Spread of CEM's threshold over its seeds and initial values."""
+        cell = str(self.task.paper_cell)
+        tables = {seed: self.tables[seed, cell] for seed in range(len(self.learners))}
+        job = publish.spread_job(self.store, self.task, tables)
+        self.finish("CEM seeds", [job])
+        return job
+
+    @cached_property
+    def figures(self) -> Job:
+        """Figures and video of the first learner in the paper's cell."""
+        cell = str(self.task.paper_cell)
+        episodes = next(job for job in self.episodes if job.label == f"{cell} learner 0")
+        tables = self.tables[0, cell]
+        job = publish.figures_job(self.store, self.task, self.learners[0], episodes, tables, self.scores)
+        self.finish("figures", [job])
+        return job
+
     def _gives_back(self, cell: object) -> bool:
         return cell in self.task.cells[: self.profile.give_back_cells]
 
@@ -138,10 +164,3 @@ def run_job(root: str, job: Job) -> str:
         job.run(folder, *job.arguments)
     return job.label
 
-
-def bench(profile: Profile, tasks: Iterable[Task], store: Store, workers: int) -> None:
-    """The main job: every stage of every task, and the published tables after each task."""
-    for task in tasks:
-        run = Run(task, profile, store, workers)
-        folder = publish.publish(run)
-        console.print(f"[bold]{task.name}[/]: leaderboard in [cyan]{folder / 'leaderboard.md'}[/]")

@@ -18,8 +18,10 @@ import pandas as pd
 
 from safeswitch import demos, registry
 from safeswitch.files import load_frame, save_arrays, save_frame
+from safeswitch.handover.episode import run_episode
 from safeswitch.handover.panel import Calibration, Panel
-from safeswitch.handover.table import HandoverTable, concatenate, record_table
+from safeswitch.handover.table import HandoverTable, concatenate, join_chunks, record_table
+from safeswitch.protocols import ARMINGS, Arming
 from safeswitch.scoring.rows import episode_rows, latched_rows
 from safeswitch.scoring.signal_quality import signal_quality
 from safeswitch.store import Key, Store
@@ -37,21 +39,19 @@ PHYSICS = (
     "safeswitch.tasks.base",
     "safeswitch.tasks.disturbances",
     "safeswitch.tasks.models",
+    "safeswitch.tasks.simulator",
     "safeswitch.expert.codegen",
     "safeswitch.expert.ddp",
+    "safeswitch.expert.ddp_parts",
     "safeswitch.expert.mpc",
 )
-LEARNING = (
-    "safeswitch_baselines.learners.networks",
-    "safeswitch_baselines.learners.bayesian",
-    "safeswitch_baselines.learners.training",
-)
-HANDOVER = ("safeswitch.handover.episode", "safeswitch.handover.table", "safeswitch_baselines.signals")
-RULES = (
-    "safeswitch.handover.panel",
-    "safeswitch.scoring.rows",
-    *(f"safeswitch_baselines.rules.{name}" for name in ("base", "bounds", "cem", "controls", "search", "thresholds")),
-)
+HANDOVER = ("safeswitch.handover.episode", "safeswitch.handover.outcomes", "safeswitch.handover.table")
+
+
+def source_of(kind: registry.Kind, name: str) -> str:
+    """Package (or module) whose source a registered learner, signal or method depends on."""
+    module = registry.find(kind, name).__module__
+    return module.rpartition(".")[0] or module
 
 
 @dataclass(frozen=True)
@@ -65,9 +65,9 @@ class Job:
     arguments: tuple[Any, ...]
 
 
-def make_env(task: Task, cell: Cell) -> TaskEnv:
+def make_env(task: Task, cell: Cell, **kwargs: Any) -> TaskEnv:
     """The task's environment in a cell, without Gymnasium's wrappers."""
-    env: Any = gymnasium.make(task.env_id, **cell.env_kwargs).unwrapped
+    env: Any = gymnasium.make(task.env_id, **cell.env_kwargs, **kwargs).unwrapped
     return env
 
 
@@ -93,7 +93,7 @@ def learner_job(store: Store, task: Task, profile: Profile, seed: int, demonstra
     """A learner trained on the demonstrations; `seed` draws its initial weights, batches and dropout."""
     options = {**task.learner_options, **profile.learner_options}
     settings = {"learner": task.learner, "seed": seed, **options}
-    key = store.key("learner", settings, [demonstrations.key], LEARNING)
+    key = store.key("learner", settings, [demonstrations.key], [source_of("learner", task.learner)])
     arguments = (task, options, seed, str(store.folder(demonstrations.key)))
     return Job("learner", f"{task.name} learner {seed}", key, _train, arguments)
 
@@ -101,11 +101,16 @@ def learner_job(store: Store, task: Task, profile: Profile, seed: int, demonstra
 def _train(folder: Path, task: Task, options: dict[str, Any], seed: int, dataset_root: str) -> None:
     factory = registry.find("learner", task.learner)
     learner = factory.train(demos.load(task.dataset, Path(dataset_root)), seed, options)
-    learner.save(folder)
+    learner.save(folder / "learner")
 
 
 def table_jobs(store: Store, task: Task, cell: Cell, split: Split, count: int, learner: Job) -> list[Job]:
-    """The handover table of one (cell, learner) on the first `count` seeds of a split, in chunks of episodes."""
+    """The handover table of one (cell, learner) on the first `count` seeds of a split, in chunks of episodes.
+
+    Outcomes are computed here for the cells whose tables are used again and again (`Cell.complete`); elsewhere they
+    are computed when a rule first asks for them.
+    """
+    code = [*PHYSICS, *task.code(), *HANDOVER, source_of("learner", task.learner), "safeswitch_baselines.signals"]
     jobs = []
     for first in range(0, count, CHUNK):
         size = min(CHUNK, count - first)
@@ -116,8 +121,9 @@ def table_jobs(store: Store, task: Task, cell: Cell, split: Split, count: int, l
             "first": first,
             "count": size,
             "signals": list(task.signals),
+            "complete": cell.complete,
         }
-        key = store.key("table", settings, [learner.key], [*PHYSICS, *task.code(), *HANDOVER, *LEARNING])
+        key = store.key("table", settings, [learner.key], code)
         label = f"{cell} {split} {first}-{first + size - 1} ({learner.label})"
         arguments = (task, cell, split, first, size, str(store.folder(learner.key)))
         jobs.append(Job("table", label, key, _tabulate, arguments))
@@ -127,9 +133,10 @@ def table_jobs(store: Store, task: Task, cell: Cell, split: Split, count: int, l
 def _tabulate(folder: Path, task: Task, cell: Cell, split: Split, first: int, count: int, learner: str) -> None:
     env = make_env(task, cell)
     signals = [registry.make_signal(name) for name in task.signals]
-    table = record_table(
-        env, load_learner(task, learner), signals, env.make_expert(), episode_seeds(split, count, first)
-    )
+    seeds = episode_seeds(split, count, first)
+    table = record_table(env, load_learner(task, learner), signals, env.make_expert(), seeds)
+    if cell.complete:
+        table.complete()
     table.save(folder / "table.npz")
     env.close()
 
@@ -137,12 +144,14 @@ def _tabulate(folder: Path, task: Task, cell: Cell, split: Split, first: int, co
 @cache
 def load_learner(task: Task, folder: str) -> Any:
     """The trained learner, loaded once per process."""
-    return registry.find("learner", task.learner).load(Path(folder))
+    return registry.find("learner", task.learner).load(Path(folder) / "learner")
 
 
-def load_table(store: Store, jobs: list[Job]) -> HandoverTable:
-    """The chunks of a table put together."""
-    return concatenate([HandoverTable.load(store.folder(job.key) / "table.npz") for job in jobs])
+def load_table(store: Store, task: Task, cell: Cell, keys: tuple[str, ...]) -> HandoverTable:
+    """The chunks of a table put together, with a simulator that resolves the outcomes still unknown."""
+    table = join_chunks([HandoverTable.load(store.folder(key) / "table.npz") for key in keys])
+    env = make_env(task, cell)
+    return table.attach(env, env.make_expert())
 
 
 @dataclass(frozen=True)
@@ -155,18 +164,28 @@ class CellTables:
     test_nominal: tuple[str, ...]
 
 
+    def load(self, store: Store, task: Task, cell: Cell) -> dict[str, HandoverTable]:
+        """Each table by the name of its attribute; tables of the same episodes are one object."""
+        on = task.calibrated_on(cell)
+        cells = {"calibrate": on, "calibrate_nominal": task.none_cell, "test": cell, "test_nominal": task.none_cell}
+        by_keys: dict[tuple[str, ...], HandoverTable] = {}
+        for name, its_cell in cells.items():
+            keys = getattr(self, name)
+            if keys not in by_keys:
+                by_keys[keys] = load_table(store, task, its_cell, keys)
+        return {name: by_keys[getattr(self, name)] for name in cells}
+
+
 def episodes_job(
     store: Store, task: Task, cell: Cell, learner_seed: int, learner: Job, tables: CellTables, give_back: bool
 ) -> Job:
     """Calibrate every method and score it on the test episodes of one (learner, cell), under both armings."""
-    settings = {
-        "cell": str(cell),
-        "learner_seed": learner_seed,
-        "methods": list(methods(task.signals)),
-        "give_back": give_back,
-    }
+    ids = methods(task.signals)
+    settings = {"cell": str(cell), "learner_seed": learner_seed, "methods": list(ids), "give_back": give_back}
     keys = [*tables.calibrate, *tables.calibrate_nominal, *tables.test, *tables.test_nominal]
-    key = store.key("episodes", settings, [learner.key, *keys], RULES)
+    rules = {source_of("method", name.partition("@")[0]) for name in ids}
+    code = ["safeswitch.handover.panel", "safeswitch.scoring.rows", *sorted(rules)]
+    key = store.key("episodes", settings, [learner.key, *keys], code)
     arguments = (str(store.root), task, cell, learner_seed, str(store.folder(learner.key)), tables, give_back)
     return Job("episodes", f"{cell} learner {learner_seed}", key, _score_episodes, arguments)
 
@@ -181,17 +200,11 @@ def _score_episodes(
     tables: CellTables,
     give_back: bool,
 ) -> None:
-    store = Store(Path(root))
-    loaded = {name: _load_chunks(store, getattr(tables, name)) for name in CellTables.__dataclass_fields__}
+    loaded = tables.load(Store(Path(root)), task, cell)
     frames, logs = [], {}
-    for protocol in ("start",) if cell.tag == "none" else ("onset", "start"):
-        test = _panel(loaded["test"], loaded["test_nominal"], cell, protocol)
-        on = task.calibrated_on(cell)
-        calibration = Calibration(
-            _panel(loaded["calibrate"], loaded["calibrate_nominal"], on, protocol),
-            loaded["calibrate_nominal"],
-            seed=learner_seed,
-        )
+    for protocol in protocols_of(cell):
+        test = test_panel(loaded, cell, protocol)
+        calibration = calibration_of(loaded, task, cell, protocol, learner_seed)
         for method_id in methods(task.signals):
             method: Method = registry.make_method(method_id)
             if not method.latched and not give_back:
@@ -201,17 +214,33 @@ def _score_episodes(
                 rows = latched_rows(test, calibrated)
             else:
                 rows = _plain_rows(task, cell, learner, test, calibrated.rule)
-            frames.append(_labelled(rows, cell, protocol, method_id, learner_seed, calibrated, str(on)))
+            on = str(task.calibrated_on(cell))
+            frames.append(_labelled(rows, cell, protocol, method_id, learner_seed, calibrated, on))
             logs.update({f"{protocol}|{method_id}|{name}": value for name, value in calibrated.log.items()})
     save_frame(folder / "episodes.npz", pd.concat(frames, ignore_index=True))
     save_arrays(folder / "logs.npz", **logs)
+    loaded["test"].save(folder / "test.npz", snapshots=False)
 
 
-def _load_chunks(store: Store, keys: tuple[str, ...]) -> HandoverTable:
-    return concatenate([HandoverTable.load(store.folder(key) / "table.npz") for key in keys])
+def protocols_of(cell: Cell) -> tuple[Arming, ...]:
+    """Armings under which a cell is scored: without a disturbance there is no onset."""
+    return ("start",) if cell.tag == "none" else ARMINGS
 
 
-def _panel(table: HandoverTable, nominal: HandoverTable, cell: Cell, protocol: Any) -> Panel:
+def test_panel(loaded: dict[str, HandoverTable], cell: Cell, protocol: Arming) -> Panel:
+    """Test episodes of a cell under an arming."""
+    return _panel(loaded["test"], loaded["test_nominal"], cell, protocol)
+
+
+def calibration_of(
+    loaded: dict[str, HandoverTable], task: Task, cell: Cell, protocol: Arming, seed: int
+) -> Calibration:
+    """Calibrate episodes of a cell under an arming."""
+    panel = _panel(loaded["calibrate"], loaded["calibrate_nominal"], task.calibrated_on(cell), protocol)
+    return Calibration(panel, loaded["calibrate_nominal"], seed=seed)
+
+
+def _panel(table: HandoverTable, nominal: HandoverTable, cell: Cell, protocol: Arming) -> Panel:
     """Disturbed episodes, and under `start` their undisturbed twins beside them."""
     if cell.tag == "none":
         return Panel(nominal, protocol)
@@ -220,8 +249,6 @@ def _panel(table: HandoverTable, nominal: HandoverTable, cell: Cell, protocol: A
 
 def _plain_rows(task: Task, cell: Cell, learner: str, test: Panel, rule: Any) -> pd.DataFrame:
     """Rules that give control back have no table: drive the same episodes."""
-    from safeswitch.handover.episode import run_episode
-
     signals = [registry.make_signal(name) for name in task.signals]
     envs = {True: make_env(task, cell), False: make_env(task, task.none_cell)}
     experts = {kind: env.make_expert() for kind, env in envs.items()}
@@ -256,14 +283,14 @@ def signals_job(store: Store, task: Task, cell: Cell, learner_seed: int, tables:
     """Signal quality of one (learner, cell) against the undisturbed twins."""
     settings = {"cell": str(cell), "learner_seed": learner_seed, "signals": list(task.signals)}
     keys = [*tables.test, *tables.test_nominal]
-    key = store.key("signals", settings, keys, ["safeswitch.scoring.signal_quality"])
+    key = store.key("signals", settings, keys, ["safeswitch.scoring.signal_quality", "safeswitch.handover.table"])
     arguments = (str(store.root), task, cell, learner_seed, tables)
     return Job("signals", f"{cell} learner {learner_seed}", key, _score_signals, arguments)
 
 
 def _score_signals(folder: Path, root: str, task: Task, cell: Cell, learner_seed: int, tables: CellTables) -> None:
-    store = Store(Path(root))
-    disturbed, twins = _load_chunks(store, tables.test), _load_chunks(store, tables.test_nominal)
+    loaded = tables.load(Store(Path(root)), task, cell)
+    disturbed, twins = loaded["test"], loaded["test_nominal"]
     rows = []
     for signal in task.signals:
         quality = signal_quality(

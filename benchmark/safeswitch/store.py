@@ -96,6 +96,8 @@ class Key(str):
 class Store:
     """Results by key under one folder; any number of processes may share it.
 
+    A store reads source files once; after a change of code make a new one, as every run does.
+
     Args:
         root: the folder. Default: `SAFESWITCH_STORE`, else `.safeswitch/store` in the checkout, else
             `~/.cache/safeswitch/store` for an installed wheel.
@@ -103,6 +105,7 @@ class Store:
 
     def __init__(self, root: Path | str | None = None) -> None:
         self.root = Path(root).expanduser().absolute() if root is not None else default_root()
+        self._code: dict[Any, list[tuple[str, str]]] = {}  # read once: all keys of a run mean the same source
 
     def __repr__(self) -> str:
         return f"Store({str(self.root)!r})"
@@ -132,7 +135,7 @@ class Store:
             "stage": stage,
             "settings": jsonable(settings),
             "inputs": [str(key) for key in inputs],
-            "code": dict(sorted(pair for each in code for pair in _code_hashes(each))),
+            "code": dict(sorted(pair for each in code for pair in self._hashes(each))),
             "libraries": {name: _version(name) for name in sorted(libraries)},
             "python": platform.python_version(),
         }
@@ -195,6 +198,11 @@ class Store:
                 self._discard(self.root / key)
         self._sweep()
         return freed
+
+    def _hashes(self, code: str | Path | Callable[..., Any]) -> list[tuple[str, str]]:
+        if code not in self._code:
+            self._code[code] = list(_code_hashes(code))
+        return self._code[code]
 
     def _existing(self, key: str) -> Path:
         if not self.has(key):

@@ -40,6 +40,11 @@ class Cell:
         return f"{self.task}/{self.disturbance}" + (f"-{self.severity}" if self.severity else "")
 
     @property
+    def complete(self) -> bool:
+        """Whether every outcome is computed in advance: cells that many rules, and published tables, come back to."""
+        return self.tag == "none" or (self.tag == "paper" and self.severity == 3)
+
+    @property
     def env_kwargs(self) -> dict[str, Any]:
         """Keyword arguments of `gymnasium.make`."""
         return {} if self.tag == "none" else {"disturbance": self.disturbance, "severity": self.severity}

@@ -170,7 +170,7 @@ def _learning_rate(config: MLPConfig, step: int, steps: int) -> float:
 def _validation(episodes: np.ndarray, fraction: float, seed: int) -> np.ndarray:
     """Boolean (n,): samples of the held-out episodes. Whole episodes, as neighbouring steps are nearly copies."""
     names = np.unique(episodes)
-    count = min(int(round(fraction * len(names))), len(names) - 1)
+    count = min(math.ceil(fraction * len(names)), len(names) - 1)
     chosen = stream(seed, "validation-episodes").permutation(names)[:count]
     return np.isin(episodes, chosen)
 

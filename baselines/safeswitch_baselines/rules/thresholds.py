@@ -1,8 +1,7 @@
-"""Thresholds set by hand: quantiles of the undisturbed signal, and absolute values declared once for all tasks."""
+"""Thresholds set by hand: quantiles of the undisturbed signal, and absolute values, the same for every task."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import ClassVar
 
 import numpy as np
@@ -10,9 +9,6 @@ import numpy as np
 from safeswitch.handover.panel import Calibration
 from safeswitch.protocols import Calibrated
 from safeswitch_baselines.rules.base import SignalMethod, ThresholdRule
-
-ABSOLUTE_VALUES = (0.05, 0.1, 0.2, 0.4)
-"""Hand-set thresholds in action units, the same for every task: 5 % to 40 % of the largest action."""
 
 
 class FixedStepQuantile(SignalMethod):
@@ -60,18 +56,45 @@ class FixedEpisodeMax95(SignalMethod):
 class FixedValue(SignalMethod):
     """`fixed-0.1@` and so on: an absolute value in the signal's units, set by hand without any data."""
 
+    family = "fixed"
+
     def __init__(self, signal: str | None, value: float):
-        self.family = f"fixed-{value:g}"  # type: ignore[misc]
         super().__init__(signal)
         self.value = value
+
+    @property
+    def id(self) -> str:
+        """`fixed-<value>@signal`."""
+        return f"fixed-{self.value:g}@{self.signal}"
 
     def calibrate(self, calibration: Calibration) -> Calibrated:
         """Nothing to choose."""
         return Calibrated(ThresholdRule(self.signal, self.value), self.value)
 
 
-def _fixed(value: float) -> Callable[[str | None], FixedValue]:
-    return lambda signal=None: FixedValue(signal, value)
+class Fixed005(FixedValue):
+    """5 % of the largest action."""
+
+    def __init__(self, signal: str | None):
+        super().__init__(signal, 0.05)
 
 
-fixed_005, fixed_01, fixed_02, fixed_04 = (_fixed(value) for value in ABSOLUTE_VALUES)
+class Fixed01(FixedValue):
+    """10 % of the largest action."""
+
+    def __init__(self, signal: str | None):
+        super().__init__(signal, 0.1)
+
+
+class Fixed02(FixedValue):
+    """20 % of the largest action."""
+
+    def __init__(self, signal: str | None):
+        super().__init__(signal, 0.2)
+
+
+class Fixed04(FixedValue):
+    """40 % of the largest action."""
+
+    def __init__(self, signal: str | None):
+        super().__init__(signal, 0.4)

@@ -31,6 +31,9 @@ REMEDY = "apt-get install -y libegl1 libgl1-mesa-dri"
 
 MAX_GEOMS = 1000
 
+_gl_process: int | None = None
+"""Process that has used OpenGL first, here or in a parent."""
+
 
 def has_egl() -> bool:
     """Whether the EGL library can be loaded (Linux only)."""
@@ -121,6 +124,7 @@ class Renderer:
         """Picture (height, width, 3) of `data`, whose kinematics must be up to date, in the looks of `model`."""
         if not self._close.alive:
             raise RuntimeError("this renderer is closed")
+        _refuse_after_fork()
         mj = self._mujoco
         self._gl.make_current()
         everything = mj.mjtCatBit.mjCAT_ALL.value
@@ -162,6 +166,7 @@ def _camera(model: mujoco.MjModel, name: str) -> mujoco.MjvCamera:
 
 def _gl_context(width: int, height: int) -> Any:
     """An off-screen OpenGL context of the chosen backend."""
+    _refuse_after_fork()
     backend = os.environ.get("MUJOCO_GL", "").strip().lower()
     on_linux = sys.platform.startswith("linux")
     if on_linux and backend in ("", "egl", "disabled") and not has_egl():
@@ -178,6 +183,18 @@ def _gl_context(width: int, height: int) -> Any:
     except Exception as error:
         advice = f" On Debian or Ubuntu run: {REMEDY}" if on_linux else ""
         raise RuntimeError(f"cannot render: OpenGL (MUJOCO_GL={backend or 'unset'}) fails: {error}.{advice}") from error
+
+
+def _refuse_after_fork() -> None:
+    """Refuse OpenGL in a forked child of a process that has used it: the driver's threads are gone and it would hang."""
+    global _gl_process
+    if _gl_process is None:
+        _gl_process = os.getpid()
+    if _gl_process != os.getpid():
+        raise RuntimeError(
+            "cannot render: this process was forked from one that had rendered already, in which OpenGL would hang. "
+            "Start workers with the method 'spawn', for example gym.make_vec(..., vector_kwargs={'context': 'spawn'})"
+        )
 
 
 @contextmanager

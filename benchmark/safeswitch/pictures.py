@@ -1,0 +1,140 @@
+"""Figures and video of one task: CEM's learning (the paper's Figure 1), one episode, thresholds, and a short film."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from safeswitch import registry, stages
+from safeswitch.files import load_arrays, load_frame
+from safeswitch.handover.episode import Episode, NeverSwitch, run_episode
+from safeswitch.handover.panel import Panel
+from safeswitch.protocols import Arming, Driver
+from safeswitch.scoring import figures
+from safeswitch.scoring.leaderboard import read_csv
+from safeswitch.scoring.video import replay_frames, write_side_by_side
+from safeswitch.store import Store
+
+if TYPE_CHECKING:
+    from safeswitch.stages import CellTables
+    from safeswitch.suite import Cell, Task
+
+RULE = "cem@total"
+"""The paper's rule, of which the pictures are."""
+
+SIGNAL = "total"
+
+
+def draw(folder: Path, root: str, task: Task, learner: str, episodes: str, tables: CellTables, scores: str) -> None:
+    """Draw everything into `folder`/figures, for the first learner in the paper's cell."""
+    store, cell = Store(Path(root)), task.paper_cell
+    target = folder / "figures"
+    target.mkdir(parents=True)
+    loaded = tables.load(store, task, cell)
+    rows = load_frame(store.folder(episodes) / "episodes.npz")
+    logs = load_arrays(store.folder(episodes) / "logs.npz")
+    table = read_csv(store.folder(scores) / "leaderboard.csv")
+    for protocol in stages.protocols_of(cell):
+        calibration = stages.calibration_of(loaded, task, cell, protocol, seed=0)
+        _draw_cem(calibration.panel, rows, logs, protocol, cell, target)
+        _draw_sweep(stages.test_panel(loaded, cell, protocol), rows, protocol, cell, target)
+        place = (cell.disturbance, cell.severity)
+        figures.figure_plane(table, task.name, place, protocol, target / f"plane-{protocol}.png")
+    _draw_episode(task, cell, learner, loaded["test"], rows, target)
+
+
+def _threshold(rows: pd.DataFrame, protocol: str, method: str = RULE) -> float:
+    chosen = rows[(rows["protocol"] == protocol) & (rows["method"] == method)]
+    return float(chosen["threshold"].iloc[0])
+
+
+def _draw_cem(
+    panel: Panel, rows: pd.DataFrame, logs: dict[str, Any], protocol: Arming, cell: Cell, target: Path
+) -> None:
+    prefix = f"{protocol}|{RULE}|"
+    log = {name.removeprefix(prefix): value for name, value in logs.items() if name.startswith(prefix)}
+    figures.figure_cem(
+        log,
+        panel.margins(SIGNAL),
+        _threshold(rows, protocol),
+        target / f"cem-{protocol}.png",
+        f"{RULE} in {cell}, armed at {protocol}",
+    )
+
+
+def _draw_sweep(panel: Panel, rows: pd.DataFrame, protocol: Arming, cell: Cell, target: Path) -> None:
+    thresholds = np.geomspace(0.01, 2.0, 300)
+    returns = {
+        name: panel.returns(panel.handover_at(name, thresholds)).mean(axis=1) for name in panel.table.signals
+    }
+    marks = {
+        f"{rule}@{SIGNAL}": _threshold(rows, protocol, f"{rule}@{SIGNAL}")
+        for rule in ("cem", "grid", "fixed-q99", "fixed-epmax95")
+    }
+    never = np.full(len(panel), panel.table.horizon)
+    levels = {
+        "learner": float(panel.returns(never).mean()),
+        "expert": float(panel.returns(panel.executed(panel.arming_step)).mean()),
+    }
+    figures.figure_threshold_sweep(
+        thresholds, returns, marks, target / f"thresholds-{protocol}.png", levels, f"{cell}, armed at {protocol}"
+    )
+
+
+def _draw_episode(task: Task, cell: Cell, learner: str, table: Any, rows: pd.DataFrame, target: Path) -> None:
+    """The first test episode that the learner alone fails and the rule saves: its signals, and a film of three drivers."""
+    chosen = rows[(rows["protocol"] == "onset") & (rows["method"] == RULE)]
+    saved = chosen[chosen["success"] & ~chosen["learner_success"]]
+    row = (saved if len(saved) else chosen).iloc[0]
+    threshold, seed = float(row["threshold"]), int(row["seed"])
+    index = int(np.flatnonzero(table.seeds == seed)[0])
+    env = stages.make_env(task, cell)
+    drivers: dict[str, tuple[Any, Arming]] = {
+        "learner": (NeverSwitch(), "start"),
+        RULE: (_Threshold(threshold), "onset"),
+        "expert": (_Threshold(-np.inf, Driver.EXPERT), "start"),
+    }
+    runs = {name: _drive(task, env, learner, rule, seed, arming) for name, (rule, arming) in drivers.items()}
+    figures.figure_episode(
+        runs["learner"].signals,
+        env.control_dt,
+        int(table.onset[index]),
+        runs[RULE].handover,
+        float(table.t_first[index]),
+        threshold,
+        SIGNAL,
+        target / "episode.png",
+        f"{cell}, seed {seed}: signals of the learner alone",
+    )
+    film = stages.make_env(task, cell, render_mode="rgb_array")
+    panels = [replay_frames(film, episode, name) for name, episode in runs.items()]
+    write_side_by_side(panels, target / "episode.mp4", round(1 / env.control_dt))
+    film.close()
+
+
+class _Threshold:
+    """The paper's latched rule, with the driver it starts with: enough to drive the film."""
+
+    def __init__(self, threshold: float, first: Driver = Driver.LEARNER):
+        self.threshold, self.first = threshold, first
+
+    def reset(self, seed: int) -> None:
+        self.driver = self.first
+
+    def arm(self, step: int) -> Driver:
+        return self.driver
+
+    def update(self, step: int, signals: Mapping[str, float]) -> Driver:
+        if signals[SIGNAL] > self.threshold:
+            self.driver = Driver.EXPERT
+        return self.driver
+
+
+def _drive(task: Task, env: Any, learner: str, rule: Any, seed: int, arming: Arming) -> Episode:
+    signals = [registry.make_signal(name) for name in task.signals]
+    driver = stages.load_learner(task, learner)
+    return run_episode(env, driver, signals, rule, env.make_expert(), seed, arming, record_snapshots=True)

@@ -1,0 +1,214 @@
+"""Writes what a run found: leaderboard, signals, comparisons, CEM's spread, manifest, figures and a short video.
+
+Tables of several tasks share one folder: running one task replaces that task's rows only.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+import shutil
+import subprocess
+import time
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+
+from safeswitch import pictures
+from safeswitch.files import load_json, save_json
+from safeswitch.scoring.comparisons import paired_comparisons
+from safeswitch.scoring.leaderboard import leaderboard, merge_task_rows, read_csv, write_csv
+from safeswitch.scoring.markdown import write_markdown
+from safeswitch.scoring.metrics import TaskInfo
+from safeswitch.scoring.signal_quality import signal_table
+from safeswitch.stages import Job, calibration_of, load_rows, make_env, protocols_of
+from safeswitch.store import Store
+from safeswitch.suite import SPLIT_SIZE, SPLITS, TASKS, Cell, Task, methods
+from safeswitch import registry
+
+if TYPE_CHECKING:
+    from safeswitch.pipeline import Run
+    from safeswitch.stages import CellTables
+
+TABLES = ("leaderboard", "signals", "comparisons", "cem_seeds")
+LIBRARIES = ("casadi", "dm-control", "gymnasium", "minari", "mujoco", "numpy", "pandas", "scipy", "torch")
+CEM_SEEDS = 10
+"""Seeds with which CEM is repeated to show the spread of mu*."""
+
+
+def publish(run: Run, folder: Path | None = None) -> Path:
+    """Run every stage of a task and write its results; returns the folder."""
+    folder = (folder or default_folder(run.profile.name)).absolute()
+    started = time.time()
+    commit = git_commit()  # before anything is written into the checkout
+    scores, spread, figures = run.scores, run.spread, run.figures
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in TABLES:
+        source = run.store.folder((spread if name == "cem_seeds" else scores).key) / f"{name}.csv"
+        target = folder / f"{name}.csv"
+        write_csv(merge_task_rows(target if target.exists() else None, read_csv(source)), target)
+    _replace(run.store.folder(figures.key) / "figures", folder / "figures" / run.task.name)
+    if run.profile.tables:
+        _write_tables(run, folder / "tables" / run.task.name)
+    manifest = _manifest(run, folder, commit, time.time() - started)
+    save_json(folder / "manifest.json", manifest)
+    write_markdown(
+        read_csv(folder / "leaderboard.csv"),
+        folder / "leaderboard.md",
+        {name: (task.paper_cell.disturbance, task.paper_cell.severity) for name, task in TASKS.items()},
+        privileged=[name for name in methods(run.task.signals) if "privileged" in registry.make_method(name).needs],
+        give_back=[name for name in methods(run.task.signals) if not registry.make_method(name).latched],
+        notes=[f"{name}: profile {entry['profile']}, commit {entry['commit']}" for name, entry in manifest.items()],
+    )
+    return folder
+
+
+def default_folder(profile: str) -> Path:
+    """`results/` for the full profile, `results/local/<profile>/` otherwise; in the checkout, else in this folder."""
+    checkout = Path(__file__).resolve().parents[2]
+    base = (checkout if (checkout / "pyproject.toml").is_file() else Path.cwd()) / "results"
+    return base if profile == "full" else base / "local" / profile
+
+
+def scores_job(store: Store, task: Task, episodes: list[Job], signals: list[Job]) -> Job:
+    """Leaderboard, signal quality and paired comparisons of one task."""
+    keys = [job.key for job in [*episodes, *signals]]
+    code = ["safeswitch.scoring"]
+    key = store.key("scores", {"task": task.name}, keys, code)
+    return Job("scores", task.name, key, _score, (str(store.root), task, episodes, signals))
+
+
+def _score(folder: Path, root: str, task: Task, episodes: list[Job], signals: list[Job]) -> None:
+    store, infos = Store(Path(root)), {task.name: task_info(task)}
+    rows = load_rows(store, episodes, "episodes.npz")
+    write_csv(leaderboard(rows, infos), folder / "leaderboard.csv")
+    write_csv(paired_comparisons(rows, infos), folder / "comparisons.csv")
+    write_csv(signal_table(load_rows(store, signals, "signals.npz")), folder / "signals.csv")
+
+
+def task_info(task: Task) -> TaskInfo:
+    """What scoring knows of a task."""
+    env = make_env(task, task.none_cell)
+    return TaskInfo(horizon=env.horizon, control_dt=env.control_dt)
+
+
+def spread_job(store: Store, task: Task, tables: dict[int, CellTables]) -> Job:
+    """mu* of CEM over its seeds, and from initial values ten times off, in the paper's cell."""
+    keys = [key for table in tables.values() for key in (*table.calibrate, *table.calibrate_nominal)]
+    settings = {"task": task.name, "seeds": CEM_SEEDS, "signals": list(task.signals)}
+    code = ["safeswitch.handover.panel", "safeswitch_baselines.rules"]
+    return Job("spread", task.name, store.key("spread", settings, keys, code), _spread, (str(store.root), task, tables))
+
+
+def _spread(folder: Path, root: str, task: Task, tables: dict[int, CellTables]) -> None:
+    rows: list[dict[str, Any]] = []
+    for learner, table in tables.items():
+        cell = task.paper_cell
+        loaded = table.load(Store(Path(root)), task, cell)
+        for protocol in protocols_of(cell):
+            for seed in range(CEM_SEEDS):
+                calibration = calibration_of(loaded, task, cell, protocol, seed)
+                for family in ("cem", "cem-high", "cem-low"):
+                    for signal in task.signals:
+                        learned = registry.make_method(f"{family}@{signal}").calibrate(calibration)
+                        rows.append(_spread_row(cell, protocol, f"{family}@{signal}", learner, seed, learned.threshold))
+    write_csv(pd.DataFrame(rows), folder / "cem_seeds.csv")
+
+
+def _spread_row(cell: Cell, protocol: str, method: str, learner: int, seed: int, threshold: float) -> dict[str, Any]:
+    return {
+        "task": cell.task,
+        "disturbance": cell.disturbance,
+        "severity": cell.severity,
+        "protocol": protocol,
+        "method": method,
+        "learner": learner,
+        "cem_seed": seed,
+        "threshold": threshold,
+    }
+
+
+def figures_job(store: Store, task: Task, learner: Job, episodes: Job, tables: CellTables, scores: Job) -> Job:
+    """Figures and video of the first learner in the paper's cell."""
+    keys = [learner.key, episodes.key, scores.key]
+    code = ["safeswitch.pictures", "safeswitch.scoring.figures", "safeswitch.scoring.video"]
+    arguments = (str(store.root), task, str(store.folder(learner.key)), episodes.key, tables, scores.key)
+    return Job("figures", task.name, store.key("figures", {"task": task.name}, keys, code), pictures.draw, arguments)
+
+
+def _write_tables(run: Run, folder: Path) -> None:
+    """Tables of the first three cells: signals and every outcome that is known, to score latched rules without MuJoCo."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for job in run.episodes:
+        cell, learner = job.arguments[2], job.arguments[3]
+        if cell in run.task.cells[:3]:
+            target = folder / f"{cell.disturbance}-{cell.severity}-learner{learner}.npz"
+            shutil.copyfile(run.store.folder(job.key) / "test.npz", target)
+
+
+def _replace(source: Path, target: Path) -> None:
+    shutil.rmtree(target, ignore_errors=True)
+    shutil.copytree(source, target)
+
+
+def _manifest(run: Run, folder: Path, commit: str, seconds: float) -> dict[str, Any]:
+    """The folder's manifest with this task's entry replaced."""
+    path = folder / "manifest.json"
+    manifest = load_json(path) if path.exists() else {}
+    manifest[run.task.name] = {
+        "commit": commit,
+        "profile": run.profile.name,
+        "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "versions": {"python": platform.python_version(), **{name: _version(name) for name in LIBRARIES}},
+        "hardware": {"machine": platform.machine(), "processor": _processor(), "workers": run.workers},
+        "learner_seeds": list(range(run.profile.learners)),
+        "episodes": {"calibrate": run.profile.calibrate, "test": run.profile.test},
+        "episode_seeds": {split: index * SPLIT_SIZE for index, split in enumerate(SPLITS)},
+        "stage_seconds": {name: round(value, 1) for name, value in run.seconds.items()},
+        "wall_seconds": round(seconds, 1),
+        "store_keys": {"demonstrations": run.demonstrations.key, "scores": run.scores.key},
+        "sha256": {f"{name}.csv": _sha(run.store.folder(run.scores.key) / f"{name}.csv") for name in TABLES[:3]},
+    }
+    return dict(sorted(manifest.items()))
+
+
+def git_commit() -> str:
+    """Hash of the checkout's commit, with "-dirty" if tracked files were changed; "unknown" outside a checkout."""
+    root = Path(__file__).resolve().parents[2]
+
+    def git(*arguments: str) -> str:
+        return subprocess.run(["git", "-C", str(root), *arguments], capture_output=True, text=True, check=True).stdout
+
+    try:
+        changed = [line for line in git("status", "--porcelain", "-uno").splitlines() if "results/" not in line]
+        return git("rev-parse", "HEAD").strip() + ("-dirty" if changed else "")
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
+def _processor() -> str:
+    """Name of the processor, as far as the system tells."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor()
+
+
+def _version(distribution: str) -> str:
+    try:
+        return version(distribution)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def _sha(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def thresholds_of(rows: pd.DataFrame) -> dict[str, float]:
+    """Threshold of each method in a leaderboard's rows, where it has one."""
+    return {row["method"]: float(row["threshold"]) for _, row in rows.iterrows() if np.isfinite(row["threshold"])}
