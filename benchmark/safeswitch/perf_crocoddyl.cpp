@@ -109,6 +109,7 @@ void* croco_make(int nx, int nu, int np, int horizon, const double* lo, const do
   auto action = std::make_shared<GeneratedAction>(nx, nu, lo, hi, solver->parameters.data());
   std::vector<std::shared_ptr<crocoddyl::ActionModelAbstract>> running(horizon, action);
   solver->problem = std::make_shared<crocoddyl::ShootingProblem>(Eigen::VectorXd::Zero(nx), running, action);
+  solver->problem->set_nthreads(1);  // several threads cost milliseconds at this size, and share the scratch memory
   solver->ddp = std::make_unique<crocoddyl::SolverBoxDDP>(solver->problem);
   return solver;
 }

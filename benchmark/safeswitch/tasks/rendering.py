@@ -34,6 +34,9 @@ MAX_GEOMS = 1000
 _gl_process: int | None = None
 """Process that has used OpenGL first, here or in a parent."""
 
+_abandoned: list[Any] = []
+"""OpenGL objects that this process or thread cannot free; kept, because their destructors would try to."""
+
 
 def has_egl() -> bool:
     """Whether the EGL library can be loaded (Linux only)."""
@@ -143,6 +146,7 @@ def _free(gl: Any, context: Any, thread: int, process: int) -> None:
     """Free the objects of one renderer in its own context: in another one they would be somebody else's."""
     # A context belongs to its thread, and after a fork to the parent: there, leaking is the only safe choice.
     if thread != threading.get_ident() or process != os.getpid():
+        _abandoned.append((gl, context))
         return
     gl.make_current()
     context.free()
@@ -186,7 +190,7 @@ def _gl_context(width: int, height: int) -> Any:
 
 
 def _refuse_after_fork() -> None:
-    """Refuse OpenGL in a forked child of a process that has used it: the driver's threads are gone and it would hang."""
+    """Refuse OpenGL in a forked child of a process that has used it: without the driver's threads it would hang."""
     global _gl_process
     if _gl_process is None:
         _gl_process = os.getpid()
