@@ -91,9 +91,11 @@ install_debian() {
     sudo apt-get update && sudo apt-get install -y --no-install-recommends ${debian[*]}"
   fi
   say "installing Debian packages: ${debian[*]}"
-  # Quiet but for errors, which apt-get writes to standard error.
-  "${command[@]}" update -qq >/dev/null && "${command[@]}" install -y -qq --no-install-recommends "${debian[@]}" >/dev/null \
-    || die "apt-get failed. Once it works again: apt-get update && apt-get install -y ${debian[*]}"
+  # Quiet but for errors, which apt-get writes to standard error. A package source of the machine's that does not
+  # answer need not matter to us.
+  "${command[@]}" update -qq >/dev/null || say "apt-get update failed: going on with the package lists that are there"
+  "${command[@]}" install -y -qq --no-install-recommends "${debian[@]}" >/dev/null \
+    || die "apt-get failed. Once it works again, as root: apt-get update && apt-get install -y ${debian[*]}"
 }
 
 install_python_packages() {

@@ -28,7 +28,8 @@ def test_parameters_are_those_of_the_task() -> None:
 
 
 @pytest.mark.parametrize(
-    "design", [{}, {"cart_mass": 0.2}, {"pole_length": 0.8, "pole_inertia": 0.01}, {"cart_damping": 2.0, "force_limit": 6.0}]
+    "design",
+    [{}, {"cart_mass": 0.2}, {"pole_length": 0.8, "pole_inertia": 0.01}, {"cart_damping": 2.0, "force_limit": 6.0}],
 )
 def test_model_agrees_with_mujoco_over_a_second(design: dict[str, float]) -> None:
     env = CartPoleEnv(**{"rail": 20.0, **design})

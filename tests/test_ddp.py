@@ -14,6 +14,7 @@ from scipy.optimize import lsq_linear
 
 from safeswitch.expert import cart_pole_model as cart_pole
 from safeswitch.expert import ddp_parts as parts
+from safeswitch.expert.box_qp import box_qp_function
 from safeswitch.expert.ddp import MAX_ITERATIONS, DDPSolver, Problem, make_solver
 
 Array = NDArray[np.float64]
@@ -115,7 +116,7 @@ def test_parameters_are_inputs() -> None:
 
 @pytest.mark.parametrize("nu", [1, 2, 3])
 def test_box_qp_agrees_with_enumeration(nu: int) -> None:
-    box_qp = parts.box_qp_function(f"qp{nu}", nu)
+    box_qp = box_qp_function(f"qp{nu}", nu)
     rng = np.random.default_rng(nu)
     for _ in range(300):
         root = rng.normal(size=(nu, nu))
@@ -176,12 +177,14 @@ def test_hessians_agree_with_finite_differences() -> None:
 
     def slopes(z: Array) -> tuple[Array, Array]:
         """Jacobians of f and r by central differences."""
-        eye = 1e-5 * np.eye(5)
+        plus, minus = ([z + sign * e for e in 1e-5 * np.eye(5)] for sign in (1, -1))
         columns = [
-            [(np.array(g(z[:4] + e[:4], z[4:] + e[4:], PARAMETERS)) - np.array(g(z[:4] - e[:4], z[4:] - e[4:], PARAMETERS)))
-             / 2e-5 for e in eye]
+            [
+                (g(a[:4], a[4:], PARAMETERS) - g(b[:4], b[4:], PARAMETERS)).full() / 2e-5
+                for a, b in zip(plus, minus, strict=True)
+            ]
             for g in (f, r)
-        ]  # fmt: skip
+        ]
         return np.hstack(columns[0]), np.hstack(columns[1])
 
     for exact in (False, True):
@@ -220,7 +223,9 @@ def test_solution_is_a_trajectory_with_its_cost() -> None:
 
 def test_second_order_terms_find_the_same_optimum() -> None:
     start = np.full((34, 1), 0.1)
-    plans = [swing_up(exact).solve(HANGING, PARAMETERS, start, iterations=250, tolerance=1e-13) for exact in (False, True)]
+    plans = [
+        swing_up(exact).solve(HANGING, PARAMETERS, start, iterations=250, tolerance=1e-13) for exact in (False, True)
+    ]
     polished = swing_up(True).solve(HANGING, PARAMETERS, plans[0].u, iterations=250, tolerance=1e-13)
     assert polished.cost == pytest.approx(plans[0].cost, rel=1e-7)
     np.testing.assert_allclose(polished.u, plans[0].u, atol=1e-3)

@@ -94,6 +94,18 @@ def test_missing_packages_are_installed_without_questions(machine: Machine, user
     assert len(machine.installs()) == 1
 
 
+def test_a_package_source_that_does_not_answer_is_no_obstacle_but_a_failed_install_is(machine: Machine) -> None:
+    machine.virtual_environment()
+    machine.command("id", "echo 0")
+    machine.command("cc", "exit 1")
+    machine.command("gcc", "exit 1")
+    for failing, code in (("update", 0), ("install", 1)):
+        machine.command("apt-get", f'case "$*" in *{failing}*) exit 100;; esac')
+        done = machine.setup()
+        assert done.returncode == code and "failed" in done.stderr
+    assert "as root: apt-get update && apt-get install -y gcc libc6-dev" in done.stderr
+
+
 def test_egl_is_probed_unless_another_opengl_is_chosen(machine: Machine) -> None:
     machine.virtual_environment()
     machine.command("apt-get", "exit 0")

@@ -1,10 +1,10 @@
 """How fast the expert plans, beside crocoddyl's SolverBoxDDP on the same problem in the same run.
 
 Both minimise the same generated cost over the same generated dynamics with Gauss-Newton Hessians; crocoddyl's action
-model is C++ (`perf_crocoddyl.cpp`), compiled with the flags of the expert's own code. crocoddyl's own library is used as
-pip installs it. Timings of the two alternate, so that a busy machine slows both.
+model is C++ (`perf_crocoddyl.cpp`) that calls generated C, compiled with the flags of the expert's own code. Its
+library is used as pip installs it, on one thread. Timings of the two alternate, so that a busy machine slows both.
 
-* *us per iteration*: both solve the swing-up from rest with the same first controls, for a fixed number of iterations.
+* *us per iteration*: both solve the swing-up from the same first trajectory, for a fixed number of iterations.
 * *us per warm step*: both start from the same shifted plans along an episode, and stop at the first iteration whose
   cost is within 1e-6 of the optimum.
 
@@ -28,15 +28,16 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from safeswitch.expert import ddp_parts as parts
-from safeswitch.expert.cart_pole_model import dynamics, make_cart_pole_expert, residuals
+from safeswitch.expert.cart_pole_model import SWINGS, SwingCandidates, dynamics, make_cart_pole_expert, residuals
 from safeswitch.expert.codegen import FLAGS, find_compiler, source
-from safeswitch.expert.ddp import DDPSolver, Problem, make_solver
+from safeswitch.expert.ddp import DDPSolver, Problem, Solution, make_solver
+from safeswitch.expert.graph import expanded
 
 Array = NDArray[np.float64]
 
 PARAMETERS = np.array([1.0, 0.1, 0.5, 1e-4, 0.05, 0.001, 10.0])
-HANGING = np.array([0.0, 0.0, np.pi, 0.0])
+HANGING = np.array([0.0, 0.0, np.pi - 0.05, 0.0])
+CONTROL_DT = 0.06  # [s]
 EQUAL_COST = 1e-6  # relative
 ITERATIONS = 15  # of a timed swing-up; neither solver has converged by then
 WARM_STEPS = 60
@@ -44,7 +45,7 @@ NEVER = 1e-300  # crocoddyl wants a positive stopping threshold
 INSTALL = "pip install crocoddyl==3.2.1 cmeel-eigen"
 
 
-class Unavailable(RuntimeError):
+class UnavailableError(RuntimeError):
     """The comparison cannot run here; the message says what to install."""
 
 
@@ -66,7 +67,7 @@ def expert_benchmark(horizon: int = 50, repeats: int = 40) -> dict[str, Any]:
     results["us_per_iteration"] = median(ours() for _ in range(repeats)) / ITERATIONS
     try:
         results.update(compare(solver, repeats))
-    except Unavailable as reason:
+    except UnavailableError as reason:
         results["skipped"] = str(reason)
     return results
 
@@ -74,7 +75,8 @@ def expert_benchmark(horizon: int = 50, repeats: int = 40) -> dict[str, Any]:
 def expert_steps(repeats: int) -> dict[str, float]:
     """Microseconds of a whole `MPC.action` call in Python: cold, and warm along an episode (model = plant)."""
     mpc = make_cart_pole_expert()
-    cold, warm = [], []
+    cold: list[float] = []
+    warm: list[float] = []
     for _ in range(max(repeats // 10, 3)):
         mpc.reset()
         state = HANGING
@@ -89,12 +91,16 @@ def expert_steps(repeats: int) -> dict[str, float]:
 def swing_up_solver(horizon: int) -> DDPSolver:
     """The expert's solver for `horizon` controls."""
     stage, terminal = residuals(2.0)
-    return make_solver("cart_pole", dynamics(0.06), stage, terminal, horizon, -1.0, 1.0)
+    return make_solver("cart_pole", dynamics(CONTROL_DT), stage, terminal, horizon, -1.0, 1.0)
 
 
 def first_plan(solver: DDPSolver) -> tuple[Array, Array]:
-    """Feasible states and controls from which the swing-up is timed."""
-    plan = solver.solve(HANGING, PARAMETERS, np.full((solver.problem.horizon, 1), 0.1), iterations=0)
+    """Feasible states and controls from which the swing-up is timed: the roll-out of an energy-shaping swing.
+
+    From here both solvers end in the same optimum; from arbitrary controls each may find its own.
+    """
+    swing = SwingCandidates(solver.problem, CONTROL_DT)(HANGING, PARAMETERS)[-len(SWINGS)]
+    plan = solver.solve(HANGING, PARAMETERS, swing.u, iterations=0)
     return plan.x, plan.u
 
 
@@ -108,7 +114,7 @@ def solve(solver: DDPSolver, x: Array, u: Array, iterations: int, tolerance: flo
 
 
 def compare(solver: DDPSolver, repeats: int) -> dict[str, Any]:
-    """crocoddyl's numbers, and the ratios of ours to them."""
+    """Numbers of crocoddyl, and the ratios of ours to them."""
     rival = Crocoddyl(solver.problem)
     x, u = first_plan(solver)
     solve(solver, x, u, 200, 1e-13)
@@ -150,16 +156,24 @@ def warm_steps(solver: DDPSolver, rival: Crocoddyl, repeats: int) -> tuple[list[
         x_init = best.x[np.minimum(np.arange(1, horizon + 2), horizon)]
         start = solver.solve(state, PARAMETERS, best.u[shift], x_init, best.K[shift], iterations=0)
         best = solver.solve(state, PARAMETERS, start.u, start.x, iterations=200, tolerance=1e-12)
-        goal = best.cost * (1 + EQUAL_COST) + 1e-9
-
-        needed = _first(lambda n: _our_cost(solver, start.x, start.u, n), goal)
-        rival_needed = _first(lambda n: rival.solve(start.x, start.u, n, NEVER)[0], goal)
-        if needed == 0 or rival_needed == 0:  # one of them ended in another local minimum: no common cost
-            continue
-        timer = _timer(lambda: solve(solver, start.x, start.u, needed, 0.0))
-        ours.append(median(timer() for _ in range(repeats)))
-        theirs.append(median(1e6 * rival.solve(start.x, start.u, rival_needed, NEVER)[2] for _ in range(repeats)))
+        times = equal_cost_times(solver, rival, start, best.cost * (1 + EQUAL_COST) + 1e-9, repeats)
+        if times is not None:
+            ours.append(times[0])
+            theirs.append(times[1])
     return ours, theirs
+
+
+def equal_cost_times(
+    solver: DDPSolver, rival: Crocoddyl, start: Solution, goal: float, repeats: int
+) -> tuple[float, float] | None:
+    """Microseconds of each until the cost `goal`; None if one of them ended in another local minimum."""
+    needed = _first(lambda n: _our_cost(solver, start.x, start.u, n), goal)
+    rival_needed = _first(lambda n: rival.solve(start.x, start.u, n, NEVER)[0], goal)
+    if needed == 0 or rival_needed == 0:
+        return None
+    timer = _timer(lambda: solve(solver, start.x, start.u, needed, 0.0))
+    pairs = [(timer(), 1e6 * rival.solve(start.x, start.u, rival_needed, NEVER)[2]) for _ in range(repeats)]
+    return median(pair[0] for pair in pairs), median(pair[1] for pair in pairs)
 
 
 def _our_cost(solver: DDPSolver, x: Array, u: Array, iterations: int) -> float:
@@ -216,7 +230,7 @@ def compile_rival(problem: Problem, folder: Path) -> Path:
     """Compile the C++ program with the generated C code into a library in `folder`."""
     compiler, plain = shutil.which("g++"), find_compiler()
     if compiler is None or plain is None:
-        raise Unavailable("no g++ on the PATH (on Debian or Ubuntu: apt-get install -y g++)")
+        raise UnavailableError("no g++ on the PATH (on Debian or Ubuntu: apt-get install -y g++)")
     prefix = crocoddyl_prefix()
     flags = [flag for flag in FLAGS if flag != "-shared"]
     objects = []
@@ -225,8 +239,9 @@ def compile_rival(problem: Problem, folder: Path) -> Path:
         c_file.write_text(source(function))
         _compile([plain, *flags, "-c", str(c_file), "-o", str(built)])
         objects.append(str(built))
-    # crocoddyl's wheel is built for plain x86-64: matrices that cross the border must be aligned as it expects.
-    cpp = [compiler, "-std=c++17", *FLAGS, "-DNDEBUG", "-DEIGEN_MAX_ALIGN_BYTES=16"]
+    # The wheel is built for the plain architecture, and Eigen's allocator depends on it: with -march=native here,
+    # matrices would be allocated one way and freed the other. This file only passes pointers on; the arithmetic is in `objects`.
+    cpp = [compiler, "-std=c++17", "-O3", "-DNDEBUG", "-fPIC", "-shared"]
     cpp += [f"-I{prefix / 'include'}", f"-I{prefix / 'include' / 'eigen3'}"]
     library = folder / "libperf_crocoddyl.so"
     program = Path(__file__).with_name("perf_crocoddyl.cpp")
@@ -240,17 +255,17 @@ def crocoddyl_prefix() -> Path:
     try:
         distribution = importlib.metadata.distribution("libcrocoddyl")
     except importlib.metadata.PackageNotFoundError:
-        raise Unavailable(f"crocoddyl is not installed ({INSTALL})") from None
+        raise UnavailableError(f"crocoddyl is not installed ({INSTALL})") from None
     prefix = Path(str(distribution.locate_file("cmeel.prefix")))
     if not (prefix / "include" / "eigen3" / "Eigen" / "Core").is_file():
-        raise Unavailable(f"Eigen's headers are not installed ({INSTALL})")
+        raise UnavailableError(f"Eigen's headers are not installed ({INSTALL})")
     return prefix
 
 
 def _compile(command: list[str]) -> None:
     answer = subprocess.run(command, capture_output=True, text=True, check=False)
     if answer.returncode != 0:
-        raise Unavailable(f"{command[0]} failed: {answer.stderr.strip()[-800:]}")
+        raise UnavailableError(f"{command[0]} failed: {answer.stderr.strip()[-800:]}")
 
 
 def action_functions(problem: Problem) -> list[ca.Function]:
@@ -260,10 +275,10 @@ def action_functions(problem: Problem) -> list[ca.Function]:
     rx, ru, end_x = ca.jacobian(r, x), ca.jacobian(r, u), ca.jacobian(end, x)
     slopes = [ca.jacobian(f, x), ca.jacobian(f, u), rx.T @ r, ru.T @ r]
     return [
-        parts.expanded("perf_calc", [x, u, p], [f, 0.5 * ca.sumsqr(r)]),
-        parts.expanded("perf_diff", [x, u, p], [*slopes, rx.T @ rx, ru.T @ ru, rx.T @ ru]),
-        parts.expanded("perf_end_calc", [x, p], [0.5 * ca.sumsqr(end)]),
-        parts.expanded("perf_end_diff", [x, p], [end_x.T @ end, end_x.T @ end_x]),
+        expanded("perf_calc", [x, u, p], [f, 0.5 * ca.sumsqr(r)]),
+        expanded("perf_diff", [x, u, p], [*slopes, rx.T @ rx, ru.T @ ru, rx.T @ ru]),
+        expanded("perf_end_calc", [x, p], [0.5 * ca.sumsqr(end)]),
+        expanded("perf_end_diff", [x, p], [end_x.T @ end, end_x.T @ end_x]),
     ]
 
 

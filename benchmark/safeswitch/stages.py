@@ -214,7 +214,7 @@ def _score_episodes(
                 rows = latched_rows(test, calibrated)
             else:
                 rows = _plain_rows(task, cell, learner, test, calibrated.rule)
-            on = str(task.calibrated_on(cell))
+            on = "" if task.calibrated_on(cell) == cell else str(task.calibrated_on(cell))
             frames.append(_labelled(rows, cell, protocol, method_id, learner_seed, calibrated, on))
             logs.update({f"{protocol}|{method_id}|{name}": value for name, value in calibrated.log.items()})
     save_frame(folder / "episodes.npz", pd.concat(frames, ignore_index=True))

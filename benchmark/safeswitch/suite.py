@@ -75,8 +75,8 @@ class Task:
     cells: tuple[Cell, ...]
     modules: tuple[str, ...]
     assets: tuple[str, ...]
-    learner_options: Mapping[str, Any] = field(default_factory=dict)
-    demonstrations: Mapping[str, Any] = field(default_factory=dict)
+    learner_options: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    demonstrations: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
     @property
     def paper_cell(self) -> Cell:

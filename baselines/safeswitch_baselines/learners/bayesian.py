@@ -31,7 +31,7 @@ from safeswitch_baselines.learners.networks import (
     InputEncoding,
     MaskLayout,
     MLPConfig,
-    bounded_log_var_numpy,
+    bounded_variance,
 )
 
 if TYPE_CHECKING:
@@ -262,7 +262,7 @@ def moments(
     action = np.add.reduce(mu, axis=1) / samples
     deviation = mu - action[:, None]
     epistemic_var = np.add.reduce(deviation * deviation, axis=1) / samples
-    aleatoric_var = np.add.reduce(np.exp(bounded_log_var_numpy(raw, bounds)), axis=1) / samples
+    aleatoric_var = np.add.reduce(bounded_variance(raw, bounds), axis=1) / samples
     return action, epistemic_var, aleatoric_var
 
 

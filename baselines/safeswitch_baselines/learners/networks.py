@@ -10,6 +10,7 @@ Masks are arguments, never drawn inside: training draws them from its own genera
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -247,11 +248,10 @@ def bounded_log_var(raw: Tensor, bounds: tuple[float, float]) -> Tensor:
     return low + nn.functional.softplus(below - low)
 
 
-def bounded_log_var_numpy(raw: NDArray[np.float64], bounds: tuple[float, float]) -> NDArray[np.float64]:
-    """`bounded_log_var` in float64 numpy, for one decision."""
+def bounded_variance(raw: NDArray[np.float64], bounds: tuple[float, float]) -> NDArray[np.float64]:
+    """`exp(bounded_log_var(raw, bounds))` in numpy, for one decision; the two soft bounds have a closed form."""
     low, high = bounds
-    below = high - np.logaddexp(0.0, high - raw)
-    return low + np.logaddexp(0.0, below - low)
+    return math.exp(low) + 1.0 / (math.exp(-high) + np.exp(-np.maximum(raw, -500.0)))  # -500: exp stays finite
 
 
 def gaussian_nll(mean: Tensor, log_var: Tensor, target: Tensor, beta: float = 0.0) -> Tensor:

@@ -1,7 +1,7 @@
 r"""Cart-pole for the expert: dynamics and swing-up cost in CasADi, and `make_cart_pole_expert`.
 
-State ``[x, x_dot, theta, theta_dot]`` ([m], [m/s], [rad], [rad/s]); theta = 0 is upright and theta > 0 leans towards +x, the bob
-standing at (x + l sin theta, l cos theta). Action in [-1, 1], force = force_limit * action [N]. From the Lagrangian,
+State ``[x, x_dot, theta, theta_dot]`` ([m], [m/s], [rad], [rad/s]); theta = 0 is upright and theta > 0 leans towards
++x: the bob is at (x + l sin theta, l cos theta). Action in [-1, 1], force = force_limit * action [N]. From the Lagrangian,
 
 .. math::
     (m_c + m_p) \ddot x + m_p l \cos\theta\, \ddot\theta &= F - d_x \dot x + m_p l \sin\theta\, \dot\theta^2, \\
@@ -16,9 +16,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from safeswitch.expert import ddp_parts as parts
 from safeswitch.expert.codegen import Kernel, build
 from safeswitch.expert.ddp import Problem, make_solver
+from safeswitch.expert.graph import expanded
 from safeswitch.expert.mpc import MPC, MPCConfig, Policy, StationaryGain
 
 Array = NDArray[np.float64]
@@ -34,9 +34,9 @@ PARAMETERS: tuple[str, ...] = (
 )
 GRAVITY = 9.81  # [m/s^2]
 
-WEIGHT_X, WEIGHT_X_DOT, WEIGHT_ANGLE, WEIGHT_THETA_DOT, WEIGHT_ACTION = 1.0, 0.1, 5.0, 0.1, 0.005
+WEIGHT_X, WEIGHT_X_DOT, WEIGHT_ANGLE, WEIGHT_THETA_DOT, WEIGHT_ACTION = 1.0, 0.1, 5.0, 0.1, 10.0
 WEIGHT_RAIL, RAIL_SHARE = 200.0, 0.8  # squared hinge beyond this share of the rail: plans stay on it
-WEIGHT_TERMINAL = 10.0  # of the state's cost, at the end of the horizon
+WEIGHT_TERMINAL = 1.0  # of the state's cost, at the end of the horizon
 
 # Swings of a cold start: largest action, gain on the energy, gain on the cart's position [1/m], first side. Chosen
 # greedily among 26 candidates (40 restarts beside them) by the cost of the best plan over 240 states.
@@ -114,7 +114,7 @@ def swing_function(control_dt: float, horizon: int) -> ca.Function:
     near = ca.logic_and(ca.fabs(angle) < CATCH_ANGLE, ca.fabs(x[3]) < CATCH_SPEED)
     u = ca.if_else(near, catch, pump - centre_gain * (x[0] + 0.3 * x[1]))
     u = ca.fmax(ca.fmin(u, 1), -1)
-    step = parts.expanded("cart_pole_swing_step", [x, p, K, setting], [dynamics(control_dt)(x, u, p), u])
+    step = expanded("cart_pole_swing_step", [x, p, K, setting], [dynamics(control_dt)(x, u, p), u])
 
     rows = []
     for values in SWINGS:
@@ -150,9 +150,7 @@ class SwingCandidates:
         return [*(Policy(x=upright, K=K) for upright in uprights), *swings]
 
 
-def make_cart_pole_expert(
-    control_dt: float = 0.06, horizon: int = 34, rail: float = 2.0, compiled: bool = True
-) -> MPC:
+def make_cart_pole_expert(control_dt: float = 0.06, horizon: int = 34, rail: float = 1.5, compiled: bool = True) -> MPC:
     """The cart-pole's expert.
 
     Args:
@@ -162,8 +160,6 @@ def make_cart_pole_expert(
         compiled: False runs CasADi's virtual machine even where there is a compiler.
     """
     stage, terminal = residuals(rail)
-    solver = make_solver(
-        "cart_pole", dynamics(control_dt), stage, terminal, horizon, -1.0, 1.0, compiled=compiled
-    )
+    solver = make_solver("cart_pole", dynamics(control_dt), stage, terminal, horizon, -1.0, 1.0, compiled=compiled)
     candidates = SwingCandidates(solver.problem, control_dt, compiled)
     return MPC(solver, candidates, MPCConfig(angles=(2,)))

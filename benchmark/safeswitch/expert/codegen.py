@@ -2,7 +2,8 @@
 
 `build(function)` writes the function as C, compiles it once per machine into a cache folder and returns the
 library's function; `Kernel(function)` binds input and output arrays to it, so that a call costs about a microsecond on
-top of the work itself. Without a C compiler CasADi's virtual machine runs the same expressions, about nine times slower.
+top of the work itself. Without a C compiler CasADi's virtual machine runs the same expressions, about
+nine times slower.
 
 The cache key is the hash of the generated source, the compiler's version, the flags and the processor (the code is
 built with ``-march=native``). The folder is ``$SAFESWITCH_CACHE``, or ``~/.cache/safeswitch``.
@@ -134,18 +135,14 @@ class Kernel:
 
     def __init__(self, function: ca.Function) -> None:
         self.function = function
-        self.inputs = {
-            name: _array(function.sparsity_in(i)) for i, name in enumerate(map(str, function.name_in()))
-        }
-        self.outputs = {
-            name: _array(function.sparsity_out(i)) for i, name in enumerate(map(str, function.name_out()))
-        }
+        self.inputs = {name: _array(function.sparsity_in(i)) for i, name in enumerate(map(str, function.name_in()))}
+        self.outputs = {name: _array(function.sparsity_out(i)) for i, name in enumerate(map(str, function.name_out()))}
         # The buffer object must be kept: `_trigger` points into it.
         self._buffer, self._trigger = function.buffer()
         for i, array in enumerate(self.inputs.values()):
-            self._buffer.set_arg(i, memoryview(array))
+            self._buffer.set_arg(i, array.data)
         for i, array in enumerate(self.outputs.values()):
-            self._buffer.set_res(i, memoryview(array))
+            self._buffer.set_res(i, array.data)
 
     def __call__(self) -> None:
         """Evaluate `outputs` from `inputs`."""

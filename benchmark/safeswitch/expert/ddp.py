@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from safeswitch.expert import ddp_parts as parts
 from safeswitch.expert.codegen import Kernel, build, is_compiled
+from safeswitch.expert.graph import bounded_while
 
 Array = NDArray[np.float64]
 
@@ -117,8 +118,8 @@ class DDPSolver:
 
     `solve` is the convenient call. The receding-horizon loop writes into `kernel.inputs` and calls `run`:
     ``x0 (nx,)``, ``p (np,)``, ``plan_init (N + 1, nx + nu)`` with a state and a control per row (the last control is
-    ignored), ``gains_init (N, nx * nu)``, each row K in column-major order, and ``limits (2,)`` = most iterations, tolerance.
-    Outputs are ``plan``, ``gains`` and ``info``.
+    ignored), ``gains_init (N, nx * nu)``, each row K in column-major order, and ``limits (2,)`` = most iterations and
+    tolerance. Outputs are ``plan``, ``gains`` and ``info``.
     """
 
     def __init__(self, problem: Problem, compiled: bool = True) -> None:
@@ -212,7 +213,7 @@ def solve_function(problem: Problem) -> ca.Function:
     plan, gains = ca.MX.sym("plan", nx + nu, horizon + 1), ca.MX.sym("gains", nu * nx, horizon)
 
     rollout = parts.rollout_function(problem)
-    loop = parts.bounded_while(parts.iteration_function(problem, rollout), MAX_ITERATIONS)
+    loop = bounded_while(parts.iteration_function(problem, rollout), MAX_ITERATIONS)
 
     no_feedforward = ca.MX.zeros(nu, horizon)
     trajectory, cost = rollout(x0, plan, no_feedforward, gains, 1.0, p)

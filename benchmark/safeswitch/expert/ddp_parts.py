@@ -1,4 +1,4 @@
-"""The pieces of the generated solver: derivatives, backward pass, box QP, line search, iteration (see `ddp`).
+"""The pieces of the generated solver: roll-out, derivatives, backward pass, line search, iteration (see `ddp`).
 
 Each builder returns a CasADi function. Small ones are expanded to scalar operations; they are called in chains over the
 stages, so that the C code of a stage exists once. Conditionals evaluate one branch only.
@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING
 
 import casadi as ca
 
+from safeswitch.expert.box_qp import box_qp_function, solve_spd
+from safeswitch.expert.graph import bounded_while, expanded, symmetric
+
 if TYPE_CHECKING:
     from safeswitch.expert.ddp import Problem
 
@@ -17,79 +20,6 @@ MU_MIN, MU_MAX, MU_FACTOR = 1e-6, 1e10, 1.6  # regularisation schedule of Tassa 
 MU_CONVERGED = 1e-5  # a plan only counts as converged below this regularisation
 TRIALS = 11  # line search: alpha = 10^0, 10^-0.3, ... 10^-3
 ARMIJO = 1e-4  # smallest accepted ratio of actual to expected decrease
-QP_ITERATIONS = 32  # projected Newton, two or more controls
-QP_STEPS = (1.0, 0.3, 0.1)
-
-
-def expanded(name: str, inputs: list[ca.MX], outputs: list[ca.MX]) -> ca.Function:
-    """Function of scalar operations where possible (interpolants, for one, cannot be expanded)."""
-    function = ca.Function(name, inputs, [ca.densify(output) for output in outputs], {"cse": True})
-    try:
-        return with_reciprocals(function.expand(name, {"cse": True}))
-    except RuntimeError:
-        return function
-
-
-def with_reciprocals(function: ca.Function) -> ca.Function:
-    """The same scalar function with a / b as a * (1 / b), each 1 / b computed once.
-
-    Derivatives of a quotient divide by the same denominator over and over, and a division costs several products.
-    """
-    simplified = ca.GlobalOptions.getSimplificationOnTheFly()
-    ca.GlobalOptions.setSimplificationOnTheFly(False)  # it would turn a * (1 / b) back into a / b
-    try:
-        inputs, outputs = _rebuilt(function)
-        return ca.Function(function.name(), inputs, outputs, function.name_in(), function.name_out())
-    finally:
-        ca.GlobalOptions.setSimplificationOnTheFly(simplified)
-
-
-def _rebuilt(function: ca.Function) -> tuple[list[ca.SX], list[ca.SX]]:
-    """Inputs and outputs of a scalar function, rebuilt operation by operation with shared reciprocals."""
-    inputs = [ca.SX.sym(f"i{i}", function.sparsity_in(i)) for i in range(function.n_in())]
-    outputs = [ca.SX(function.sparsity_out(i)) for i in range(function.n_out())]
-    work: list[ca.SX] = [ca.SX(0)] * function.sz_w()
-    reciprocals: dict[int, ca.SX] = {}
-    for step in range(function.n_instructions()):
-        operation, source = function.instruction_id(step), function.instruction_input(step)
-        target = function.instruction_output(step)
-        if operation == ca.OP_CONST:
-            work[target[0]] = ca.SX(function.instruction_constant(step))
-        elif operation == ca.OP_INPUT:
-            work[target[0]] = inputs[source[0]].nz[source[1]]
-        elif operation == ca.OP_OUTPUT:
-            outputs[target[0]].nz[target[1]] = work[source[0]]
-        elif operation == ca.OP_DIV:
-            below = work[source[1]]
-            work[target[0]] = work[source[0]] * reciprocals.setdefault(below.element_hash(), 1 / below)
-        elif len(source) == 2:
-            work[target[0]] = ca.SX.binary(operation, work[source[0]], work[source[1]])
-        else:
-            work[target[0]] = ca.SX.unary(operation, work[source[0]])
-    return inputs, outputs
-
-
-def bounded_while(body: ca.Function, most: int) -> ca.Function:
-    """Repeat ``carry = body(carry, constants)`` while the first element of the first carry is 1, at most `most` times.
-
-    CasADi has no loop node. Doubling gives one: W_0 = if running: body; W_j+1 = if running: W_j(W_j(.)). An early exit
-    skips what is left in log2(most) tests, and `body` appears once in the C code. `most` is rounded up to a power of 2.
-    """
-    carries = body.n_out()
-    arguments = [ca.MX.sym(f"a{i}", body.sparsity_in(i)) for i in range(body.n_in())]
-    skip = ca.Function(f"{body.name()}_skip", arguments, arguments[:carries])
-
-    def if_running(name: str, function: ca.Function) -> ca.Function:
-        guarded = ca.Function.if_else(f"{name}_if", function, skip)
-        return ca.Function(name, arguments, guarded.call([arguments[0][0], *arguments]))
-
-    loop = if_running(f"{body.name()}_1", body)
-    for level in range(1, (most - 1).bit_length() + 1):
-        once = loop.call(arguments)
-        twice = loop.call([*once, *arguments[carries:]])
-        pair = ca.Function(f"{body.name()}_pair{level}", arguments, twice)
-        loop = if_running(f"{body.name()}_{2**level}", pair)
-    return loop
 
 
 def rollout_function(problem: Problem) -> ca.Function:
@@ -120,77 +50,6 @@ def rollout_function(problem: Problem) -> ca.Function:
     total, out = terminal(state, total, p)
     name = f"{problem.name}_rollout"
     return ca.Function(name, [x0, plan, ks, gains, alpha, p], [ca.horzcat(*rows, out), total])
-
-
-def solve_spd(H: ca.MX, R: ca.MX) -> tuple[ca.MX, ca.MX]:
-    """(H^-1 R, smallest pivot) by an unrolled LDL^T factorisation; meaningful where the smallest pivot is positive."""
-    n = H.shape[0]
-    L = [[ca.MX(1.0 if i == j else 0.0) for j in range(n)] for i in range(n)]
-    D: list[ca.MX] = []
-    for j in range(n):
-        D.append(H[j, j] - sum((L[j][m] ** 2 * D[m] for m in range(j)), ca.MX(0)))
-        for i in range(j + 1, n):
-            L[i][j] = (H[i, j] - sum((L[i][m] * L[j][m] * D[m] for m in range(j)), ca.MX(0))) / D[j]
-    rows = [R[i, :] for i in range(n)]
-    for i in range(n):
-        for m in range(i):
-            rows[i] = rows[i] - L[i][m] * rows[m]
-    rows = [rows[i] / D[i] for i in range(n)]
-    for i in reversed(range(n)):
-        for m in range(i + 1, n):
-            rows[i] = rows[i] - L[m][i] * rows[m]
-    smallest = D[0]
-    for pivot in D[1:]:
-        smallest = ca.fmin(smallest, pivot)
-    return ca.vertcat(*rows), smallest
-
-
-def symmetric(matrix: ca.MX) -> ca.MX:
-    """The symmetric matrix with the upper triangle of `matrix`: half the work, and no drift."""
-    return ca.triu2symm(ca.triu(matrix))
-
-
-def box_qp_function(name: str, nu: int) -> ca.Function:
-    """(H, q, lo, hi) -> (k, free): minimiser of 0.5 k'Hk + q'k within [lo, hi], and 1 where k is not held by a bound.
-
-    One control: exact. More: projected Newton (Tassa 2014, section III; Bertsekas 1982), at most QP_ITERATIONS steps.
-    """
-    H, q = ca.MX.sym("H", nu, nu), ca.MX.sym("q", nu)
-    lo, hi = ca.MX.sym("lo", nu), ca.MX.sym("hi", nu)
-    if nu == 1:
-        newton = -q / H
-        free = ca.logic_and(newton > lo, newton < hi)
-        return expanded(name, [H, q, lo, hi], [ca.fmin(ca.fmax(newton, lo), hi), free])
-
-    state, k = ca.MX.sym("state", 2), ca.MX.sym("k", nu)  # state: running, tolerance of the gradient
-    free = box_free(H, q, lo, hi, k)
-    mask = ca.diag(free)
-    step, _ = solve_spd(mask @ H @ mask + ca.diag(1 - free), -free * (q + H @ k))
-    best, value = k, ca.dot(q + 0.5 * H @ k, k)
-    for alpha in QP_STEPS:
-        trial = ca.fmin(ca.fmax(k + alpha * step, lo), hi)
-        trial_value = ca.dot(q + 0.5 * H @ trial, trial)
-        best, value = ca.if_else(trial_value < value, trial, best), ca.fmin(value, trial_value)
-    # A clipped Newton step need not descend. One sweep of exact coordinate minimisation always does, and finds the
-    # active bounds; with them Newton's step is exact.
-    for i in range(nu):
-        moved = best[i] - (q[i] + H[i, :] @ best) / H[i, i]
-        best = ca.vertcat(best[:i], ca.fmin(ca.fmax(moved, lo[i]), hi[i]), best[i + 1 :])
-    running = ca.mmax(ca.fabs(box_free(H, q, lo, hi, best) * (q + H @ best))) > state[1]
-    body = expanded(f"{name}_newton", [state, k, H, q, lo, hi], [ca.vertcat(running, state[1]), best])
-    loop = bounded_while(body, QP_ITERATIONS)
-
-    finish = expanded(f"{name}_free", [H, q, lo, hi, k], [box_free(H, q, lo, hi, k)])
-    start = ca.vertcat(1, 1e-11 * (1 + ca.mmax(ca.fabs(q))))
-    _, solution = loop(start, ca.fmin(ca.fmax(ca.MX.zeros(nu), lo), hi), H, q, lo, hi)
-    return ca.Function(name, [H, q, lo, hi], [solution, finish(H, q, lo, hi, solution)])
-
-
-def box_free(H: ca.MX, q: ca.MX, lo: ca.MX, hi: ca.MX, k: ca.MX) -> ca.MX:
-    """1 where k is not held by a bound, 0 where the gradient pushes it into one."""
-    gradient = q + H @ k
-    held = ca.logic_or(ca.logic_and(k <= lo, gradient > 0), ca.logic_and(k >= hi, gradient < 0))
-    return 1 - held
 
 
 def expansion_function(problem: Problem) -> ca.Function:

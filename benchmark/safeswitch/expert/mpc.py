@@ -1,7 +1,7 @@
 """Receding-horizon control with a generated DDP solver (`safeswitch.expert.ddp`).
 
-*Warm start*: the last plan is shifted by a step and rolled out **with its feedback gains** from the measured state; open
-loop it would diverge about an unstable equilibrium. *Cold start*: several initial policies are optimised and the best
+*Warm start*: the last plan is shifted by a step and rolled out **with its feedback gains** from the measured state;
+open loop it would diverge about an unstable equilibrium. *Cold start*: several initial policies are optimised and the best
 plan is kept; it is a function of state and parameters alone. At least one candidate should be under stabilising
 feedback, otherwise the planner drops a balanced pole and swings it up again.
 
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from safeswitch.expert import ddp_parts as parts
 from safeswitch.expert.codegen import Kernel, build
 from safeswitch.expert.ddp import DDPSolver, Problem
+from safeswitch.expert.graph import expanded
 
 Array = NDArray[np.float64]
 
@@ -110,7 +111,7 @@ class MPC:
         """Action (nu,) within the bounds for the state (nx,) under the model parameters (np,), SI units.
 
         Raises:
-            ValueError: for a state or parameters of the wrong shape. Non-finite numbers are answered from the last plan.
+            ValueError: state or parameters of the wrong shape. Numbers that are not finite are answered from the last plan.
         """
         state, parameters = self._checked(state, parameters)
         finite = all(map(math.isfinite, state.tolist())) and all(map(math.isfinite, parameters.tolist()))
@@ -229,7 +230,7 @@ def gain_function(problem: Problem, steps: int) -> ca.Function:
     Q = parts.expansion_function(problem)(ca.MX.zeros(nx), ca.reshape(carry[nx:size], nx, nx), row, p, 0.0)
     zero, one = ca.MX.zeros(nu), ca.MX.ones(nu)
     value, gain = parts.gains_function(problem)(zero, one, *Q[:7], ca.MX.zeros(3))
-    recursion = parts.expanded(f"{problem.name}_riccati", [carry, row, p], [value, gain])
+    recursion = expanded(f"{problem.name}_riccati", [carry, row, p], [value, gain])
     value, gain = ca.MX.zeros(size + 3), ca.MX.zeros(nu * nx)
     for _ in range(steps):
         value, gain = recursion(value, ca.vertcat(x, u), p)
