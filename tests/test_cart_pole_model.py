@@ -87,8 +87,10 @@ def test_energy_is_conserved_without_friction_and_force() -> None:
 
 def test_cost_is_the_documented_one() -> None:
     stage, _ = model.residuals(2.0)
-    x, u = np.array([1.7, 0.4, 2.0, -3.0]), np.array([0.6])
-    want = 1.7**2 + 0.1 * 0.4**2 + 5 * 2 * (1 - np.cos(2.0)) + 0.1 * 9.0 + 0.005 * 0.36 + 200 * 0.1**2
+    x, u = np.array([1.9, 0.4, 2.0, -3.0]), np.array([0.6])
+    want = model.WEIGHT_X * 1.9**2 + model.WEIGHT_X_DOT * 0.4**2 + model.WEIGHT_ANGLE * 2 * (1 - np.cos(2.0))
+    want += model.WEIGHT_THETA_DOT * 9.0 + model.WEIGHT_ACTION * 0.36
+    want += model.WEIGHT_RAIL * (1.9 - model.RAIL_SHARE * 2.0) ** 2
     assert float(ca.sumsqr(stage(x, u, NOMINAL))) == pytest.approx(want)
 
 

@@ -17,14 +17,20 @@ from safeswitch.tasks.cart_pole import CartPoleEnv
 
 Array = NDArray[np.float64]
 
-NOMINAL = np.array([1.0, 0.1, 0.5, 1e-4, 0.05, 0.001, 10.0])
+NOMINAL = CartPoleEnv().parameters
 LIGHT = np.array([0.2, *NOMINAL[1:]])
 HANGING = np.array([0.1, 0.0, np.pi - 0.1, 0.0])
 
 
 @cache
 def expert() -> MPC:
-    return make_cart_pole_expert()
+    return new_expert()
+
+
+def new_expert() -> MPC:
+    mpc = CartPoleEnv().make_expert()
+    assert isinstance(mpc, MPC)
+    return mpc
 
 
 @pytest.fixture
@@ -45,7 +51,7 @@ def drive(env: CartPoleEnv, mpc: MPC) -> bool:
 
 def handovers(seeds: range, every: int) -> list[bool]:
     """Outcome of a cold handover at every few steps of episodes driven by the expert with noise in its actions."""
-    env, driver, mpc, outcomes = CartPoleEnv(), make_cart_pole_expert(), expert(), []
+    env, driver, mpc, outcomes = CartPoleEnv(), new_expert(), expert(), []
     for seed in seeds:
         env.reset(seed=seed)
         driver.reset()
@@ -128,7 +134,7 @@ def test_a_cold_plan_is_a_function_of_state_and_parameters(fresh: MPC) -> None:
     fresh.reset()
     assert fresh.action(HANGING, NOMINAL) == first
     np.testing.assert_array_equal(fresh.plan_u, plan)
-    np.testing.assert_array_equal(make_cart_pole_expert().action(HANGING, NOMINAL), first)
+    np.testing.assert_array_equal(new_expert().action(HANGING, NOMINAL), first)
 
 
 def test_angles_may_be_wrapped_or_not(fresh: MPC) -> None:
@@ -224,7 +230,7 @@ def test_satisfies_the_protocol() -> None:
 
 
 def test_virtual_machine_gives_the_same_actions(fresh: MPC) -> None:
-    interpreted = make_cart_pole_expert(compiled=False)
+    interpreted = make_cart_pole_expert(CartPoleEnv().control_dt, rail=CartPoleEnv().config.rail, compiled=False)
     env = CartPoleEnv()
     env.reset(seed=0)
     for _ in range(4):

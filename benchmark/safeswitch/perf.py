@@ -28,16 +28,18 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from safeswitch.expert.cart_pole_model import PARAMETERS as PARAMETER_NAMES
 from safeswitch.expert.cart_pole_model import SWINGS, SwingCandidates, dynamics, make_cart_pole_expert, residuals
 from safeswitch.expert.codegen import FLAGS, find_compiler, source
 from safeswitch.expert.ddp import DDPSolver, Problem, Solution, make_solver
 from safeswitch.expert.graph import expanded
+from safeswitch.tasks.cart_pole import CartPoleConfig
 
 Array = NDArray[np.float64]
 
-PARAMETERS = np.array([1.0, 0.1, 0.5, 1e-4, 0.05, 0.001, 10.0])
+TASK = CartPoleConfig()
+PARAMETERS = np.array([getattr(TASK, name) for name in PARAMETER_NAMES])
 HANGING = np.array([0.0, 0.0, np.pi - 0.05, 0.0])
-CONTROL_DT = 0.06  # [s]
 EQUAL_COST = 1e-6  # relative
 ITERATIONS = 15  # of a timed swing-up; neither solver has converged by then
 WARM_STEPS = 60
@@ -74,7 +76,7 @@ def expert_benchmark(horizon: int = 50, repeats: int = 40) -> dict[str, Any]:
 
 def expert_steps(repeats: int) -> dict[str, float]:
     """Microseconds of a whole `MPC.action` call in Python: cold, and warm along an episode (model = plant)."""
-    mpc = make_cart_pole_expert()
+    mpc = make_cart_pole_expert(TASK.control_dt, rail=TASK.rail)
     cold: list[float] = []
     warm: list[float] = []
     for _ in range(max(repeats // 10, 3)):
@@ -90,8 +92,8 @@ def expert_steps(repeats: int) -> dict[str, float]:
 
 def swing_up_solver(horizon: int) -> DDPSolver:
     """The expert's solver for `horizon` controls."""
-    stage, terminal = residuals(2.0)
-    return make_solver("cart_pole", dynamics(CONTROL_DT), stage, terminal, horizon, -1.0, 1.0)
+    stage, terminal = residuals(TASK.rail)
+    return make_solver("cart_pole", dynamics(TASK.control_dt), stage, terminal, horizon, -1.0, 1.0)
 
 
 def first_plan(solver: DDPSolver) -> tuple[Array, Array]:
@@ -99,7 +101,7 @@ def first_plan(solver: DDPSolver) -> tuple[Array, Array]:
 
     From here both solvers end in the same optimum; from arbitrary controls each may find its own.
     """
-    swing = SwingCandidates(solver.problem, CONTROL_DT)(HANGING, PARAMETERS)[-len(SWINGS)]
+    swing = SwingCandidates(solver.problem, TASK.control_dt)(HANGING, PARAMETERS)[-len(SWINGS)]
     plan = solver.solve(HANGING, PARAMETERS, swing.u, iterations=0)
     return plan.x, plan.u
 
@@ -240,7 +242,8 @@ def compile_rival(problem: Problem, folder: Path) -> Path:
         _compile([plain, *flags, "-c", str(c_file), "-o", str(built)])
         objects.append(str(built))
     # The wheel is built for the plain architecture, and Eigen's allocator depends on it: with -march=native here,
-    # matrices would be allocated one way and freed the other. This file only passes pointers on; the arithmetic is in `objects`.
+    # matrices would be allocated one way and freed the other. This file only passes pointers on;
+    # the arithmetic is in `objects`.
     cpp = [compiler, "-std=c++17", "-O3", "-DNDEBUG", "-fPIC", "-shared"]
     cpp += [f"-I{prefix / 'include'}", f"-I{prefix / 'include' / 'eigen3'}"]
     library = folder / "libperf_crocoddyl.so"

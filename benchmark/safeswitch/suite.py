@@ -115,6 +115,11 @@ TASKS: dict[str, Task] = {
         name="cart-pole",
         env_id="SafeSwitch/CartPole-v0",
         learner="bayesian-mlp",
+        learner_options={"angles": (2,), "epochs": 60},
+        demonstrations={
+            "episodes": 300,
+            "noise": {"low": 0.23, "high": 0.23, "correlated_fraction": 1.0, "correlation": 0.5},
+        },
         dataset="safeswitch/cart-pole/expert-v0",
         signals=("epistemic", "aleatoric", "total", "total-mean3", "total-mean5", "epistemic-mean3", "epistemic-mean5"),
         cells=_cart_pole_cells(),
@@ -181,7 +186,7 @@ class Profile:
 
 PROFILES: dict[str, Profile] = {
     "smoke": Profile(
-        "smoke", 1, 2, 4, 4, demonstrations={"episodes": 12}, learner_options={"hidden": (64, 64), "epochs": 20}
+        "smoke", 1, 2, 4, 4, demonstrations={"episodes": 12}, learner_options={"hidden": (64, 64), "epochs": 20, "dropout": 0.1}
     ),
     "standard": Profile("standard", 1, 3, 100, 100),
     "full": Profile("full", 5, None, 40, 40, give_back_cells=3, tables=True),

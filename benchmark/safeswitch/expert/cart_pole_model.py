@@ -1,7 +1,8 @@
 r"""Cart-pole for the expert: dynamics and swing-up cost in CasADi, and `make_cart_pole_expert`.
 
 State ``[x, x_dot, theta, theta_dot]`` ([m], [m/s], [rad], [rad/s]); theta = 0 is upright and theta > 0 leans towards
-+x: the bob is at (x + l sin theta, l cos theta). Action in [-1, 1], force = force_limit * action [N]. From the Lagrangian,
++x: the bob is at (x + l sin theta, l cos theta). Action in [-1, 1], force = force_limit * action
+[N]. From the Lagrangian,
 
 .. math::
     (m_c + m_p) \ddot x + m_p l \cos\theta\, \ddot\theta &= F - d_x \dot x + m_p l \sin\theta\, \dot\theta^2, \\

@@ -1,8 +1,8 @@
 """Receding-horizon control with a generated DDP solver (`safeswitch.expert.ddp`).
 
 *Warm start*: the last plan is shifted by a step and rolled out **with its feedback gains** from the measured state;
-open loop it would diverge about an unstable equilibrium. *Cold start*: several initial policies are optimised and the best
-plan is kept; it is a function of state and parameters alone. At least one candidate should be under stabilising
+open loop it would diverge about an unstable equilibrium. *Cold start*: several initial policies are optimised and
+the best plan is kept; it is a function of state and parameters alone. At least one candidate should be under stabilising
 feedback, otherwise the planner drops a balanced pole and swings it up again.
 
 The answer is always finite and within the bounds: when the solver fails, the last good plan is followed open loop and
@@ -111,7 +111,7 @@ class MPC:
         """Action (nu,) within the bounds for the state (nx,) under the model parameters (np,), SI units.
 
         Raises:
-            ValueError: state or parameters of the wrong shape. Numbers that are not finite are answered from the last plan.
+            ValueError: state or parameters of the wrong shape. Non-finite ones are answered from the last plan.
         """
         state, parameters = self._checked(state, parameters)
         finite = all(map(math.isfinite, state.tolist())) and all(map(math.isfinite, parameters.tolist()))
