@@ -108,7 +108,7 @@ def test_200_mass_changes() -> None:
 @pytest.mark.slow
 def test_first_gate_handover_at_every_fifth_step() -> None:
     outcomes = handovers(range(200), 5)
-    assert len(outcomes) == 4000
+    assert len(outcomes) == 200 * CartPoleEnv().horizon // 5
     assert np.mean(outcomes) >= 0.995
 
 
@@ -184,9 +184,10 @@ def test_non_finite_states_are_answered_from_the_last_plan(fresh: MPC) -> None:
         np.testing.assert_array_equal(fresh.action(np.full(4, np.nan), NOMINAL), plan[i])
     np.testing.assert_array_equal(fresh.action(states[4], np.full(7, np.inf)), plan[4])
     assert fresh.fallbacks == 4
-    answer = fresh.action(states[5], NOMINAL)  # sight regained: warm from the same plan, five steps on
+    fresh.action(states[5], NOMINAL)  # sight regained: warm from the same plan, five steps on
     assert fresh.cold_starts == 1
-    np.testing.assert_allclose(answer, plan[5], atol=0.05)
+    np.testing.assert_array_equal(fresh.plan_x[0], states[5])
+    assert fresh.fallbacks == 4
     for _ in range(60):  # longer than the plan
         assert np.abs(fresh.action(np.full(4, np.nan), NOMINAL)).max() <= 1.0
 

@@ -1,4 +1,4 @@
-"""The command line: bench, demos, train, evaluate, list, play, doctor."""
+"""The command line: bench, demos, train, evaluate, gate, list, play, doctor."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from rich.markup import escape
 from rich.table import Table
 
 from safeswitch import registry, suite
@@ -127,6 +128,31 @@ class Evaluate:
 
 
 @dataclass
+class Gate:
+    """Check a task's first gate: the expert takes over undisturbed episodes at every fifth step, and drives alone.
+
+    Attributes:
+        episodes: episode seeds per check, from the design split.
+        every: steps between the handovers that are tried.
+    """
+
+    common: tyro.conf.OmitArgPrefixes[Common]
+    episodes: int = 200
+    every: int = 5
+
+    def run(self) -> None:
+        """Do it."""
+        from safeswitch.evaluate import gate
+
+        for run in self.common.runs():
+            table = Table("check", "trials", "success", "95 % interval", title=run.task.name)
+            for row in gate(run, self.episodes, self.every):
+                interval = f"{row['lo']:.4f} to {row['hi']:.4f}"
+                table.add_row(row["check"], f"{row['successes']} of {row['trials']}", f"{row['success']:.4f}", interval)
+            console.print(table)
+
+
+@dataclass
 class List:
     """List tasks with their cells, disturbances, learners, signals, methods and profiles."""
 
@@ -191,6 +217,7 @@ Command = (
     | Annotated[Demos, tyro.conf.subcommand("demos")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[Gate, tyro.conf.subcommand("gate")]
     | Annotated[List, tyro.conf.subcommand("list")]
     | Annotated[Play, tyro.conf.subcommand("play")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
@@ -204,7 +231,7 @@ def main(arguments: list[str] | None = None) -> int:
         return command.run() or 0
     except ValueError as error:
         console.quiet = False
-        console.print(f"[bold red]error:[/] {error}", markup=True)
+        console.print("[bold red]error:[/]", escape(str(error)))
         return 2
     except KeyboardInterrupt:
         console.print("interrupted; run the same command again to continue")

@@ -22,11 +22,13 @@ from safeswitch.stages import (
     demonstrations_job,
     episodes_job,
     learner_job,
+    make_env,
     signals_job,
     table_jobs,
 )
+from safeswitch.scoring.metrics import TaskInfo
 from safeswitch.store import Store
-from safeswitch.suite import Profile, Task
+from safeswitch.suite import Cell, Profile, Task
 
 
 @dataclass
@@ -68,7 +70,21 @@ class Run:
     @cached_property
     def tables(self) -> dict[tuple[int, str], CellTables]:
         """Handover tables of each (learner seed, cell), on the calibrate and the test split."""
-        cells = self.profile.cells_of(self.task)
+        return self._tables(self.profile.cells_of(self.task))
+
+    def tables_of(self, seed: int, cell: Cell) -> CellTables:
+        """Handover tables of one (learner seed, cell), computing no other cell's."""
+        return self._tables(tuple(dict.fromkeys([self.task.calibrated_on(cell), self.task.none_cell, cell])))[
+            seed, str(cell)
+        ]
+
+    @cached_property
+    def task_info(self) -> TaskInfo:
+        """What scoring knows of the task."""
+        env = make_env(self.task, self.task.none_cell)
+        return TaskInfo(horizon=env.horizon, control_dt=env.control_dt)
+
+    def _tables(self, cells: tuple[Cell, ...]) -> dict[tuple[int, str], CellTables]:
         chunks = {
             (seed, cell, split): table_jobs(self.store, self.task, cell, split, count, learner)
             for seed, learner in enumerate(self.learners)
@@ -117,7 +133,7 @@ class Run:
     @cached_property
     def scores(self) -> Job:
         """Leaderboard, signal quality and comparisons."""
-        job = publish.scores_job(self.store, self.task, self.episodes, self.signals)
+        job = publish.scores_job(self.store, self.task, self.task_info, self.episodes, self.signals)
         self.finish("scores", [job])
         return job
 

@@ -14,20 +14,18 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import pandas as pd
 
-from safeswitch import pictures
+from safeswitch import pictures, registry
 from safeswitch.files import load_json, save_json
 from safeswitch.scoring.comparisons import paired_comparisons
 from safeswitch.scoring.leaderboard import leaderboard, merge_task_rows, read_csv, write_csv
 from safeswitch.scoring.markdown import write_markdown
 from safeswitch.scoring.metrics import TaskInfo
 from safeswitch.scoring.signal_quality import signal_table
-from safeswitch.stages import Job, calibration_of, load_rows, make_env, protocols_of
+from safeswitch.stages import Job, calibration_of, load_rows, protocols_of
 from safeswitch.store import Store
 from safeswitch.suite import SPLIT_SIZE, SPLITS, TASKS, Cell, Task, methods
-from safeswitch import registry
 
 if TYPE_CHECKING:
     from safeswitch.pipeline import Run
@@ -73,26 +71,20 @@ def default_folder(profile: str) -> Path:
     return base if profile == "full" else base / "local" / profile
 
 
-def scores_job(store: Store, task: Task, episodes: list[Job], signals: list[Job]) -> Job:
+def scores_job(store: Store, task: Task, info: TaskInfo, episodes: list[Job], signals: list[Job]) -> Job:
     """Leaderboard, signal quality and paired comparisons of one task."""
     keys = [job.key for job in [*episodes, *signals]]
     code = ["safeswitch.scoring"]
     key = store.key("scores", {"task": task.name}, keys, code)
-    return Job("scores", task.name, key, _score, (str(store.root), task, episodes, signals))
+    return Job("scores", task.name, key, _score, (str(store.root), task, info, episodes, signals))
 
 
-def _score(folder: Path, root: str, task: Task, episodes: list[Job], signals: list[Job]) -> None:
-    store, infos = Store(Path(root)), {task.name: task_info(task)}
+def _score(folder: Path, root: str, task: Task, info: TaskInfo, episodes: list[Job], signals: list[Job]) -> None:
+    store, infos = Store(Path(root)), {task.name: info}
     rows = load_rows(store, episodes, "episodes.npz")
     write_csv(leaderboard(rows, infos), folder / "leaderboard.csv")
     write_csv(paired_comparisons(rows, infos), folder / "comparisons.csv")
     write_csv(signal_table(load_rows(store, signals, "signals.npz")), folder / "signals.csv")
-
-
-def task_info(task: Task) -> TaskInfo:
-    """What scoring knows of a task."""
-    env = make_env(task, task.none_cell)
-    return TaskInfo(horizon=env.horizon, control_dt=env.control_dt)
 
 
 def spread_job(store: Store, task: Task, tables: dict[int, CellTables]) -> Job:
@@ -208,7 +200,3 @@ def _version(distribution: str) -> str:
 def _sha(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
-
-def thresholds_of(rows: pd.DataFrame) -> dict[str, float]:
-    """Threshold of each method in a leaderboard's rows, where it has one."""
-    return {row["method"]: float(row["threshold"]) for _, row in rows.iterrows() if np.isfinite(row["threshold"])}

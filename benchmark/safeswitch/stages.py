@@ -78,7 +78,7 @@ def demonstrations_job(store: Store, task: Task, profile: Profile) -> Job:
         "demonstrations",
         {"env": task.env_id, "dataset": task.dataset, **settings},
         [],
-        [*PHYSICS, *task.code(), "safeswitch.demos"],
+        [*PHYSICS, *task.code(), "safeswitch.demos", "safeswitch.datasets"],
     )
     return Job("demonstrations", task.name, key, _demonstrate, (task, settings))
 
@@ -215,9 +215,9 @@ def _score_episodes(
             else:
                 rows = _plain_rows(task, cell, learner, test, calibrated.rule)
             on = "" if task.calibrated_on(cell) == cell else str(task.calibrated_on(cell))
-            frames.append(_labelled(rows, cell, protocol, method_id, learner_seed, calibrated, on))
+            frames.append(labelled(rows, cell, protocol, method_id, learner_seed, calibrated, on))
             logs.update({f"{protocol}|{method_id}|{name}": value for name, value in calibrated.log.items()})
-    save_frame(folder / "episodes.npz", pd.concat(frames, ignore_index=True))
+    save_frame(folder / "episodes.npz", concat(frames))
     save_arrays(folder / "logs.npz", **logs)
     loaded["test"].save(folder / "test.npz", snapshots=False)
 
@@ -262,9 +262,15 @@ def _plain_rows(task: Task, cell: Cell, learner: str, test: Panel, rule: Any) ->
     return episode_rows(test, episodes)
 
 
-def _labelled(
+def concat(frames: list[pd.DataFrame]) -> pd.DataFrame:
+    """Frames below one another."""
+    return pd.concat(frames, ignore_index=True)
+
+
+def labelled(
     rows: pd.DataFrame, cell: Cell, protocol: str, method_id: str, learner_seed: int, calibrated: Any, on: str
 ) -> pd.DataFrame:
+    """Rows of `scoring.rows` with the columns that say what they are rows of."""
     return rows.assign(
         task=cell.task,
         disturbance=cell.disturbance,
@@ -309,4 +315,4 @@ def _score_signals(folder: Path, root: str, task: Task, cell: Cell, learner_seed
 
 def load_rows(store: Store, jobs: list[Job], name: str) -> pd.DataFrame:
     """The data frames that jobs wrote as `name`, put together."""
-    return pd.concat([load_frame(store.folder(job.key) / name) for job in jobs], ignore_index=True)
+    return concat([load_frame(store.folder(job.key) / name) for job in jobs])

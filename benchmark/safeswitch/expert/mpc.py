@@ -2,8 +2,8 @@
 
 *Warm start*: the last plan is shifted by a step and rolled out **with its feedback gains** from the measured state;
 open loop it would diverge about an unstable equilibrium. *Cold start*: several initial policies are optimised and
-the best plan is kept; it is a function of state and parameters alone. At least one candidate should be under stabilising
-feedback, otherwise the planner drops a balanced pole and swings it up again.
+the best plan is kept; it is a function of state and parameters alone. At least one candidate should be under
+stabilising feedback, otherwise the planner drops a balanced pole and swings it up again.
 
 The answer is always finite and within the bounds: when the solver fails, the last good plan is followed open loop and
 `MPC.fallbacks` is increased.

@@ -1,0 +1,158 @@
+"""One method in one cell, one film, and the first gate: what the command line offers besides the whole benchmark."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from joblib import Parallel, delayed, parallel_config
+
+from safeswitch import registry, stages, suite
+from safeswitch.handover.episode import Episode, NeverSwitch, continue_with_expert, run_episode
+from safeswitch.names import unknown
+from safeswitch.protocols import ARMINGS, Arming
+from safeswitch.scoring.leaderboard import leaderboard
+from safeswitch.scoring.rows import latched_rows
+from safeswitch.scoring.stats import wilson
+from safeswitch.scoring.video import replay_frames, write_side_by_side
+
+if TYPE_CHECKING:
+    from safeswitch.pipeline import Run
+    from safeswitch.suite import Cell, Task
+
+REFERENCES = ("learner", "expert", "timer")
+
+
+def find_cell(task: Task, disturbance: str, severity: int) -> Cell:
+    """The task's cell; an unknown one lists the valid ones, nearest first."""
+    for cell in task.cells:
+        if cell.disturbance == disturbance and cell.severity in (severity, 0):
+            return cell
+    raise unknown("cell", f"{task.name}/{disturbance}-{severity}", map(str, task.cells))
+
+
+def evaluate(run: Run, method_id: str, disturbance: str, severity: int, protocol: str) -> dict[str, Any]:
+    """The leaderboard's row of one latched method in one cell, on the profile's learners and episodes."""
+    arming = _checked_arming(protocol)
+    cell = find_cell(run.task, disturbance, severity)
+    if arming not in stages.protocols_of(cell):
+        raise ValueError(f"cell {cell} has no onset: score it with --protocol start")
+    method = registry.make_method(method_id)
+    if not method.latched:
+        raise ValueError(f"{method_id} gives control back: run it with bench or play, the table is for latched rules")
+    signal = method_id.partition("@")[2]
+    names = dict.fromkeys([*REFERENCES, *([f"best@{signal}"] if signal else []), method_id])
+    frames = []
+    for seed in range(len(run.learners)):
+        loaded = run.tables_of(seed, cell).load(run.store, run.task, cell)
+        test = stages.test_panel(loaded, cell, arming)
+        calibration = stages.calibration_of(loaded, run.task, cell, arming, seed)
+        for name in names:
+            calibrated = registry.make_method(name).calibrate(calibration)
+            rows = latched_rows(test, calibrated)
+            frames.append(stages.labelled(rows, cell, arming, name, seed, calibrated, ""))
+    table = leaderboard(stages.concat(frames), {run.task.name: run.task_info})
+    return dict(table[table["method"] == method_id].iloc[0])
+
+
+def play(
+    run: Run, driver: str, disturbance: str, severity: int, protocol: str, seed: int, path: Path
+) -> Episode:
+    """Drive one episode and write its film.
+
+    Args:
+        run: task and profile whose first learner drives.
+        driver: learner, expert or a method id.
+        disturbance: of the cell, or none.
+        severity: 1 to 5.
+        protocol: onset or start.
+        seed: episode seed.
+        path: .mp4 or .gif file to write.
+    """
+    if path.suffix not in (".mp4", ".gif"):
+        raise ValueError(f"--out {path}: the file must end in .mp4 or .gif")
+    arming = _checked_arming(protocol)
+    cell = find_cell(run.task, disturbance, severity)
+    rule: Any = NeverSwitch()
+    if driver != "learner":
+        on = run.task.calibrated_on(cell) if driver != "expert" else run.task.paper_cell
+        loaded = run.tables_of(0, on).load(run.store, run.task, on)
+        calibration = stages.calibration_of(loaded, run.task, on, arming, 0)
+        rule = registry.make_method(driver).calibrate(calibration).rule
+        if not hasattr(rule, "update"):
+            raise ValueError(f"{driver} needs hindsight and cannot drive an episode")
+    env = stages.make_env(run.task, cell, render_mode="rgb_array")
+    learner = stages.load_learner(run.task, str(run.store.folder(run.learners[0].key)))
+    signals = [registry.make_signal(name) for name in run.task.signals]
+    episode = run_episode(env, learner, signals, rule, env.make_expert(), seed, arming, record_snapshots=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_side_by_side([replay_frames(env, episode, driver)], path, round(1 / env.control_dt))
+    env.close()
+    return episode
+
+
+def gate(run: Run, episodes: int = 200, every: int = 5, split: suite.Split = "design") -> list[dict[str, Any]]:
+    """The first gate of a task: does the expert take over an undisturbed episode at any step, and does it drive alone?
+
+    Args:
+        run: task and profile.
+        episodes: episode seeds per check.
+        every: steps between the handovers that are tried.
+        split: episode seeds are the first ones of this split.
+
+    Returns:
+        One row per check: how many trials, how many succeeded, share and Wilson interval.
+    """
+    seeds = suite.episode_seeds(split, episodes)
+    learner = str(run.store.folder(run.learners[0].key))
+    chunks = [seeds[start : start + 10] for start in range(0, len(seeds), 10)]
+    task, none, paper = run.task, run.task.none_cell, run.task.paper_cell
+    with parallel_config("loky", n_jobs=run.workers, inner_max_num_threads=1):
+        alone = Parallel()(delayed(_expert_alone)(task, none, chunk) for chunk in chunks)
+        disturbed = Parallel()(delayed(_expert_alone)(task, paper, chunk) for chunk in chunks)
+        handed = Parallel()(delayed(_handed_over)(task, none, learner, chunk, every) for chunk in chunks)
+    return [
+        _gate_row(f"handover at every {every}th step, {none}", handed),
+        _gate_row(f"expert alone, {none}", alone),
+        _gate_row(f"expert alone, {paper}", disturbed),
+    ]
+
+
+def _expert_alone(task: Task, cell: Cell, seeds: list[int]) -> list[bool]:
+    env = stages.make_env(task, cell)
+    expert = env.make_expert()
+    outcomes = []
+    for seed in seeds:
+        env.reset(seed=seed)
+        outcomes.append(continue_with_expert(env, expert))
+    return outcomes
+
+
+def _handed_over(task: Task, cell: Cell, learner: str, seeds: list[int], every: int) -> list[bool]:
+    env = stages.make_env(task, cell)
+    table = stages.record_table(env, stages.load_learner(task, learner), [], env.make_expert(), seeds)
+    steps = np.arange(0, table.horizon, every)
+    open_ = steps[None, :] < table.length[:, None]
+    episode, step = np.nonzero(open_)
+    return table.outcome(episode, steps[step]).tolist()
+
+
+def _gate_row(name: str, outcomes: list[list[bool]]) -> dict[str, Any]:
+    flat = [outcome for chunk in outcomes for outcome in chunk]
+    low, high = wilson(sum(flat), len(flat))
+    return {
+        "check": name,
+        "trials": len(flat),
+        "successes": sum(flat),
+        "success": sum(flat) / len(flat),
+        "lo": float(low),
+        "hi": float(high),
+    }
+
+
+def _checked_arming(protocol: str) -> Arming:
+    for arming in ARMINGS:
+        if arming == protocol:
+            return arming
+    raise unknown("protocol", protocol, ARMINGS)
