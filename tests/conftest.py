@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
@@ -29,3 +30,18 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         works, message = _rendering()
         if not works:
             pytest.skip(message)
+
+
+@pytest.fixture(scope="session")
+def tiny_learner(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a small learner of the cart-pole: trained in seconds, and neither good nor bad."""
+    from safeswitch import demos
+    from safeswitch_baselines.learners.bayesian import BayesianLearner
+
+    folder = tmp_path_factory.mktemp("tiny-learner")
+    noise = {"low": 0.23, "high": 0.23, "correlated_fraction": 1.0, "correlation": 0.5}
+    demos.collect("SafeSwitch/CartPole-v0", "safeswitch/cart-pole/tiny-v0", folder, range(12), noise=noise)
+    data = demos.load("safeswitch/cart-pole/tiny-v0", folder)
+    options = {"angles": (2,), "hidden": (32, 32), "epochs": 60, "batch_size": 32}
+    BayesianLearner.train(data, 0, options).save(folder / "learner")
+    return folder / "learner"

@@ -110,7 +110,7 @@ def test_disk(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 def test_report_and_exit_code(monkeypatch: pytest.MonkeyPatch) -> None:
-    remedy = "on Debian, as root: apt-get install -y libegl1 libgl1-mesa-dri; and leave MUJOCO_GL unset " + "x" * 60
+    remedy = "on Debian, as root: apt-get install -y libegl1 libgl1-mesa-dri libopengl0; and leave it unset " + "x" * 60
     good, bad = Check("Python", True, "3.11.7"), Check("rendering", False, "no EGL [at all]", remedy)
     for checks, code in (([good], 0), ([good, bad], 1)):
         monkeypatch.setattr(doctor, "CHECKS", [lambda check=check: check for check in checks])

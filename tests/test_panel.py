@@ -6,26 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from safeswitch.handover.panel import Calibration, Panel
 from safeswitch.handover.table import HandoverTable, concatenate, new_table
 from safeswitch_baselines.rules.base import DelayRule, ThresholdRule
 from safeswitch_baselines.rules.bounds import OracleHindsight
-
-HORIZON = 12
-
-
-def random_table(seed: int, episodes: int = 6, disturbed: bool = True) -> HandoverTable:
-    """A table with arbitrary traces and outcomes, early ends included."""
-    rng = np.random.default_rng(seed)
-    success = rng.random(episodes) < 0.5
-    length = np.where(success, HORIZON, rng.integers(7, HORIZON + 1, episodes))
-    onset = rng.integers(1, 6, episodes) if disturbed else np.full(episodes, -1)
-    outcome = rng.random((episodes, HORIZON + 1)) < 0.6
-    signal = rng.integers(0, 6, (episodes, HORIZON)).astype(float)  # ties on purpose
-    ended = np.arange(HORIZON + 1)[None, :] >= length[:, None]
-    outcome = np.where(ended, success[:, None], outcome)
-    signal[ended[:, :-1]] = np.nan
-    return new_table(np.arange(episodes), onset, length, success, {"total": signal}, outcome)
+from synthetic import HORIZON, random_table
 
 
 class WithoutShortcut:
@@ -48,7 +34,8 @@ def test_threshold_shortcut_agrees_with_asking_step_by_step(seed, threshold, arm
 def test_best_threshold_is_the_best_of_all_thresholds(seed, arming):
     panel = Panel(random_table(seed), arming)
     _, best = panel.best_threshold("total")
-    every = [panel.returns(panel.handover_of(ThresholdRule("total", value))).mean() for value in np.arange(-1, 6.5, 0.5)]
+    handovers = [panel.handover_of(ThresholdRule("total", value)) for value in np.arange(-1, 6.5, 0.5)]
+    every = [panel.returns(handover).mean() for handover in handovers]
     assert best == pytest.approx(max(every))
 
 
@@ -139,7 +126,8 @@ def test_margins_hold_exactly_the_worthwhile_thresholds_around_the_best(seed):
 @given(st.integers(0, 10_000), st.sampled_from(["onset", "start"]), st.sampled_from([0.05, 5.0]))
 def test_hindsight_oracle_earns_the_maximum_over_all_steps_and_never(seed, arming, phi):
     panel = Panel(random_table(seed), arming)
-    chosen = panel.returns(panel.handover_of(OracleHindsight().calibrate(Calibration(panel, panel.table, phi)).rule), phi)
+    oracle = OracleHindsight().calibrate(Calibration(panel, panel.table, phi))
+    chosen = panel.returns(panel.handover_of(oracle.rule), phi)
     for episode in range(len(panel)):
         one = panel.take(np.array([episode]))
         steps = [*range(int(one.arming_step[0]), int(one.table.length[0])), HORIZON]
@@ -148,9 +136,9 @@ def test_hindsight_oracle_earns_the_maximum_over_all_steps_and_never(seed, armin
 
 def test_unknown_outcomes_are_resolved_once_and_shared_with_parts():
     calls = []
-    base = new_table(
-        np.arange(2), np.array([1, 1]), np.array([5, HORIZON]), np.array([False, True]), {}, np.full((2, HORIZON + 1), -1)
-    )
+    unknown = np.full((2, HORIZON + 1), -1)
+    success = np.array([False, True])
+    base = new_table(np.arange(2), np.array([1, 1]), np.array([5, HORIZON]), success, {}, unknown)
     base.sources[0].resolve = lambda episode, step: calls.append((episode, step)) or step < 3
     joined = concatenate([base.take(np.array([0])), base])
     assert joined.outcome(np.array([0, 0, 1]), np.array([2, 4, 4])).tolist() == [True, False, False]

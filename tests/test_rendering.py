@@ -215,7 +215,7 @@ def test_without_egl_physics_works_and_pictures_say_what_to_install(environment:
     )
     result = run(code, **environment)
     assert result.returncode == 1
-    assert "apt-get install -y libegl1 libgl1-mesa-dri" in result.stderr.splitlines()[-1]
+    assert "apt-get install -y libegl1 libgl1-mesa-dri libopengl0" in result.stderr.splitlines()[-1]
     assert result.stdout.startswith("(False") and rendering.REMEDY in result.stdout
 
 

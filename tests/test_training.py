@@ -129,15 +129,3 @@ def test_wrong_demonstrations_and_settings_are_refused():
         train_bayesian_mlp(empty, 0, QUICK)
     with pytest.raises(ValueError, match="unknown device 'gpu'"):
         train_bayesian_mlp(demos, 0, QUICK, device="gpu")
-
-
-@pytest.mark.slow
-def test_twenty_thousand_samples_train_within_a_minute():
-    import time
-
-    rng = np.random.default_rng(0)
-    observations = rng.normal(size=(20_000, 4)).astype(np.float32)
-    demos = Demonstrations(observations, np.tanh(observations[:, :1]).astype(np.float64), np.repeat(range(200), 100))
-    start = time.process_time()
-    train_bayesian_mlp(demos, 0, MLPConfig(angles=(2,)), device="cpu")
-    assert time.process_time() - start < 60

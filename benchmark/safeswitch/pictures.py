@@ -86,7 +86,7 @@ def _draw_sweep(panel: Panel, rows: pd.DataFrame, protocol: Arming, cell: Cell, 
 
 
 def _draw_episode(task: Task, cell: Cell, learner: str, table: Any, rows: pd.DataFrame, target: Path) -> None:
-    """The first test episode that the learner alone fails and the rule saves: its signals, and a film of three drivers."""
+    """The first test episode that the learner fails and the rule saves: its signals, and a film of three drivers."""
     chosen = rows[(rows["protocol"] == "onset") & (rows["method"] == RULE)]
     saved = chosen[chosen["success"] & ~chosen["learner_success"]]
     row = (saved if len(saved) else chosen).iloc[0]

@@ -1,8 +1,8 @@
 """READ FIRST: expert -> demonstrations -> learner -> handover tables -> switch rules -> leaderboard.
 
 A `Run` holds the stages of one task in this order; `stages.py` says what each computes, `suite.py` what is run, and
-`publish.py` writes the tables. Finished work is kept in a store by the hash of everything it depends on, so that a second run
-computes nothing and an interrupted one continues where it stopped.
+`publish.py` writes the tables. Finished work is kept in a store by the hash of everything it depends on, so that a
+second run computes nothing and an interrupted one continues where it stopped.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from functools import cached_property
 from joblib import Parallel, delayed, parallel_config
 
 from safeswitch import publish
-from safeswitch.console import Progress, console
+from safeswitch.console import Progress
+from safeswitch.scoring.metrics import TaskInfo
 from safeswitch.stages import (
     CellTables,
     Job,
@@ -26,9 +27,8 @@ from safeswitch.stages import (
     signals_job,
     table_jobs,
 )
-from safeswitch.scoring.metrics import TaskInfo
 from safeswitch.store import Store
-from safeswitch.suite import Cell, Profile, Task
+from safeswitch.suite import Cell, Profile, Split, Task
 
 
 @dataclass
@@ -85,11 +85,12 @@ class Run:
         return TaskInfo(horizon=env.horizon, control_dt=env.control_dt)
 
     def _tables(self, cells: tuple[Cell, ...]) -> dict[tuple[int, str], CellTables]:
+        counts: dict[Split, int] = {"calibrate": self.profile.calibrate, "test": self.profile.test}
         chunks = {
             (seed, cell, split): table_jobs(self.store, self.task, cell, split, count, learner)
             for seed, learner in enumerate(self.learners)
             for cell in cells
-            for split, count in (("calibrate", self.profile.calibrate), ("test", self.profile.test))
+            for split, count in counts.items()
         }
         self.finish("handover tables", [job for jobs in chunks.values() for job in jobs])
         keys = {name: tuple(job.key for job in jobs) for name, jobs in chunks.items()}
@@ -138,13 +139,15 @@ class Run:
         return job
 
     @cached_property
-    def spread(self) -> Job:
-        """Spread of CEM's threshold over its seeds and initial values."""
+    def spread(self) -> list[Job]:
+        """Spread of CEM's threshold over its seeds and initial values, one job per learner."""
         cell = str(self.task.paper_cell)
-        tables = {seed: self.tables[seed, cell] for seed in range(len(self.learners))}
-        job = publish.spread_job(self.store, self.task, tables)
-        self.finish("CEM seeds", [job])
-        return job
+        jobs = [
+            publish.spread_job(self.store, self.task, seed, self.tables[seed, cell])
+            for seed in range(len(self.learners))
+        ]
+        self.finish("CEM seeds", jobs)
+        return jobs
 
     @cached_property
     def figures(self) -> Job:

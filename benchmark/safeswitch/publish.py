@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from safeswitch import pictures, registry
-from safeswitch.files import load_json, save_json
+from safeswitch.files import load_json, save_frame, save_json
 from safeswitch.scoring.comparisons import paired_comparisons
 from safeswitch.scoring.leaderboard import leaderboard, merge_task_rows, read_csv, write_csv
 from safeswitch.scoring.markdown import write_markdown
 from safeswitch.scoring.metrics import TaskInfo
 from safeswitch.scoring.signal_quality import signal_table
-from safeswitch.stages import Job, calibration_of, load_rows, protocols_of
+from safeswitch.stages import Job, calibration_of, load_rows, protocols_of, source_of
 from safeswitch.store import Store
 from safeswitch.suite import SPLIT_SIZE, SPLITS, TASKS, Cell, Task, methods
 
@@ -31,10 +31,12 @@ if TYPE_CHECKING:
     from safeswitch.pipeline import Run
     from safeswitch.stages import CellTables
 
-TABLES = ("leaderboard", "signals", "comparisons", "cem_seeds")
+TABLES = ("leaderboard", "signals", "comparisons")
 LIBRARIES = ("casadi", "dm-control", "gymnasium", "minari", "mujoco", "numpy", "pandas", "scipy", "torch")
 CEM_SEEDS = 10
 """Seeds with which CEM is repeated to show the spread of mu*."""
+CEM_STARTS = ("cem", "cem-high", "cem-low")
+"""CEM from its own initial median, from ten times that and from a tenth."""
 
 
 def publish(run: Run, folder: Path | None = None) -> Path:
@@ -45,9 +47,8 @@ def publish(run: Run, folder: Path | None = None) -> Path:
     scores, spread, figures = run.scores, run.spread, run.figures
     folder.mkdir(parents=True, exist_ok=True)
     for name in TABLES:
-        source = run.store.folder((spread if name == "cem_seeds" else scores).key) / f"{name}.csv"
-        target = folder / f"{name}.csv"
-        write_csv(merge_task_rows(target if target.exists() else None, read_csv(source)), target)
+        _merge(folder / f"{name}.csv", read_csv(run.store.folder(scores.key) / f"{name}.csv"))
+    _merge(folder / "cem_seeds.csv", load_rows(run.store, spread, "cem_seeds.npz"))
     _replace(run.store.folder(figures.key) / "figures", folder / "figures" / run.task.name)
     if run.profile.tables:
         _write_tables(run, folder / "tables" / run.task.name)
@@ -87,27 +88,24 @@ def _score(folder: Path, root: str, task: Task, info: TaskInfo, episodes: list[J
     write_csv(signal_table(load_rows(store, signals, "signals.npz")), folder / "signals.csv")
 
 
-def spread_job(store: Store, task: Task, tables: dict[int, CellTables]) -> Job:
-    """mu* of CEM over its seeds, and from initial values ten times off, in the paper's cell."""
-    keys = [key for table in tables.values() for key in (*table.calibrate, *table.calibrate_nominal)]
-    settings = {"task": task.name, "seeds": CEM_SEEDS, "signals": list(task.signals)}
-    code = ["safeswitch.handover.panel", "safeswitch_baselines.rules"]
-    return Job("spread", task.name, store.key("spread", settings, keys, code), _spread, (str(store.root), task, tables))
+def spread_job(store: Store, task: Task, learner: int, tables: CellTables) -> Job:
+    """mu* of CEM over its seeds, and from initial values ten times off, for one learner in the paper's cell."""
+    keys = [*tables.calibrate, *tables.calibrate_nominal]
+    settings = {"task": task.name, "learner": learner, "seeds": CEM_SEEDS, "signals": list(task.signals)}
+    key = store.key("spread", settings, keys, ["safeswitch.handover.panel", source_of("method", "cem")])
+    return Job("spread", f"{task.name} learner {learner}", key, _spread, (str(store.root), task, learner, tables))
 
 
-def _spread(folder: Path, root: str, task: Task, tables: dict[int, CellTables]) -> None:
-    rows: list[dict[str, Any]] = []
-    for learner, table in tables.items():
-        cell = task.paper_cell
-        loaded = table.load(Store(Path(root)), task, cell)
-        for protocol in protocols_of(cell):
-            for seed in range(CEM_SEEDS):
-                calibration = calibration_of(loaded, task, cell, protocol, seed)
-                for family in ("cem", "cem-high", "cem-low"):
-                    for signal in task.signals:
-                        learned = registry.make_method(f"{family}@{signal}").calibrate(calibration)
-                        rows.append(_spread_row(cell, protocol, f"{family}@{signal}", learner, seed, learned.threshold))
-    write_csv(pd.DataFrame(rows), folder / "cem_seeds.csv")
+def _spread(folder: Path, root: str, task: Task, learner: int, tables: CellTables) -> None:
+    cell, rows = task.paper_cell, []
+    loaded = tables.load(Store(Path(root)), task, cell)
+    for protocol in protocols_of(cell):
+        for seed in range(CEM_SEEDS):
+            calibration = calibration_of(loaded, task, cell, protocol, seed)
+            for method in (f"{family}@{signal}" for family in CEM_STARTS for signal in task.signals):
+                learned = registry.make_method(method).calibrate(calibration)
+                rows.append(_spread_row(cell, protocol, method, learner, seed, learned.threshold))
+    save_frame(folder / "cem_seeds.npz", pd.DataFrame(rows))
 
 
 def _spread_row(cell: Cell, protocol: str, method: str, learner: int, seed: int, threshold: float) -> dict[str, Any]:
@@ -132,13 +130,18 @@ def figures_job(store: Store, task: Task, learner: Job, episodes: Job, tables: C
 
 
 def _write_tables(run: Run, folder: Path) -> None:
-    """Tables of the first three cells: signals and every outcome that is known, to score latched rules without MuJoCo."""
+    """Tables of the first three cells: signals and known outcomes, to score latched rules without MuJoCo."""
     folder.mkdir(parents=True, exist_ok=True)
     for job in run.episodes:
         cell, learner = job.arguments[2], job.arguments[3]
         if cell in run.task.cells[:3]:
             target = folder / f"{cell.disturbance}-{cell.severity}-learner{learner}.npz"
             shutil.copyfile(run.store.folder(job.key) / "test.npz", target)
+
+
+def _merge(target: Path, rows: pd.DataFrame) -> None:
+    """Replace the rows of this task in a table of all tasks."""
+    write_csv(merge_task_rows(target if target.exists() else None, rows), target)
 
 
 def _replace(source: Path, target: Path) -> None:
@@ -162,7 +165,7 @@ def _manifest(run: Run, folder: Path, commit: str, seconds: float) -> dict[str, 
         "stage_seconds": {name: round(value, 1) for name, value in run.seconds.items()},
         "wall_seconds": round(seconds, 1),
         "store_keys": {"demonstrations": run.demonstrations.key, "scores": run.scores.key},
-        "sha256": {f"{name}.csv": _sha(run.store.folder(run.scores.key) / f"{name}.csv") for name in TABLES[:3]},
+        "sha256": {f"{name}.csv": _sha(run.store.folder(run.scores.key) / f"{name}.csv") for name in TABLES},
     }
     return dict(sorted(manifest.items()))
 

@@ -40,9 +40,11 @@ PHYSICS = (
     "safeswitch.tasks.disturbances",
     "safeswitch.tasks.models",
     "safeswitch.tasks.simulator",
+    "safeswitch.expert.box_qp",
     "safeswitch.expert.codegen",
     "safeswitch.expert.ddp",
     "safeswitch.expert.ddp_parts",
+    "safeswitch.expert.graph",
     "safeswitch.expert.mpc",
 )
 HANDOVER = ("safeswitch.handover.episode", "safeswitch.handover.outcomes", "safeswitch.handover.table")

@@ -144,7 +144,7 @@ BOUNDS = ("learner", "expert", "oracle-onset", "oracle-hindsight", "timer")
 CONTROLS = ("random", "periodic", "shuffled@total")
 QUANTILES = ("fixed-q95", "fixed-q99", "fixed-q999", "fixed-epmax95")
 VALUES = ("fixed-0.05@total", "fixed-0.1@total", "fixed-0.2@total", "fixed-0.4@total")
-CEM_VARIANTS = ("cem-literal@total", "cem-high@total", "cem-low@total")
+CEM_VARIANTS = ("cem-literal@total", "cem-single@total", "cem-high@total", "cem-low@total")
 PER_SIGNAL = ("cem", "grid", "random-search", *QUANTILES, "best")
 
 

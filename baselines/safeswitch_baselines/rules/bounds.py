@@ -44,7 +44,7 @@ class Timer(PlainMethod):
         """Best mean return over all delays."""
         panel = calibration.panel
         delay = panel.best_delay(calibration.phi)
-        episodes = (panel.table.horizon // DELAY_STEP + 1) * len(panel)
+        episodes = (-(-panel.table.horizon // DELAY_STEP) + 1) * len(panel)  # every multiple below T, and T itself
         return Calibrated(DelayRule(delay), threshold=float(delay), tuning_episodes=episodes)
 
 

@@ -130,7 +130,7 @@ def run_episode(
     onset = -1 if env.onset is None else int(env.onset)
     armed_from = arming_step(env.onset, arming, horizon)
     driven = np.full(horizon, -1, np.int8)
-    actions = np.full((horizon, env.action_space.shape[0]), np.nan)
+    actions = np.full((horizon, *env.simulator.action_shape), np.nan)
     states = np.full((horizon + 1, env.state.size), np.nan)
     traces = {signal.id: np.full(horizon, np.nan) for signal in signals}
     snapshots = [env.snapshot()] if record_snapshots else []
@@ -142,7 +142,7 @@ def run_episode(
         prediction = learner.predict(observation, step)
         values = {signal.id: signal.update(observation, prediction, previous) for signal in signals}
         if step == armed_from:
-            driver = rule.arm(step)
+            driver = Driver(rule.arm(step))
         action = _expert_action(env, expert, driven, step) if driver is Driver.EXPERT else prediction.action
         env.advance(action)
         driven[step], actions[step], states[step + 1] = driver, action, env.state

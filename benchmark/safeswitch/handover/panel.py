@@ -93,11 +93,11 @@ class Panel:
     def _ask(self, rule: SwitchRule, episode: int) -> int:
         start, length = int(self.arming_step[episode]), int(self.table.length[episode])
         rule.reset(int(self.table.seeds[episode]))
-        if rule.arm(start) is Driver.EXPERT:
+        if rule.arm(start) == Driver.EXPERT:
             return start
         for step in range(start, length):
             values = {name: float(trace[episode, step]) for name, trace in self.table.signals.items()}
-            if rule.update(step, values) is Driver.EXPERT:
+            if rule.update(step, values) == Driver.EXPERT:
                 return step + 1
         return self.table.horizon
 

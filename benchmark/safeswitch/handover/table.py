@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from safeswitch.files import load_arrays, save_arrays
+from safeswitch.files import load_arrays, save_arrays_compressed
 from safeswitch.handover.episode import NeverSwitch, run_episode
 from safeswitch.handover.outcomes import UNKNOWN, Continuation, Outcomes
 from safeswitch.protocols import Array, Expert, Learner, Signal
@@ -143,9 +143,8 @@ class HandoverTable:
 
     def save(self, path: Path, snapshots: bool = True) -> None:
         """Write as .npz without pickle; without snapshots it holds only the outcomes that are known by now."""
-        save_arrays(
+        save_arrays_compressed(
             path,
-            compress=True,
             seeds=self.seeds,
             onset=self.onset,
             length=self.length,

@@ -163,7 +163,7 @@ class JointFriction(Disturbance):
     name = "joint-friction"
     kind = "dynamics"
     tasks = CART_POLES
-    levels = (1.0, 2.0, 4.0, 6.0, 8.0)
+    levels = (0.3, 0.6, 1.0, 1.5, 2.0)
     sentence = "viscous friction grows by {:g} N s/m on the rail and by 1/200 of that, in N m s/rad, in the hinge"
     HINGE_SHARE: ClassVar[float] = 1.0 / 200.0
 
@@ -181,7 +181,7 @@ class Push(Disturbance):
     name = "push"
     kind = "dynamics"
     tasks = CART_POLES
-    levels = (5.0, 10.0, 15.0, 20.0, 30.0)
+    levels = (1.5, 3.0, 5.0, 7.5, 10.0)
     sentence = "the cart is pushed with {:g} N for three control steps"
     STEPS: ClassVar[int] = 3
 

@@ -10,6 +10,7 @@ Importing this module imports neither `mujoco` nor an OpenGL library: `choose_ba
 from __future__ import annotations
 
 import ctypes
+import ctypes.util
 import os
 import sys
 import threading
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 Image = NDArray[np.uint8]
 
-REMEDY = "apt-get install -y libegl1 libgl1-mesa-dri"
+REMEDY = "apt-get install -y libegl1 libgl1-mesa-dri libopengl0"
 """The Debian command that installs what off-screen rendering needs."""
 
 MAX_GEOMS = 1000
@@ -39,14 +40,14 @@ _abandoned: list[Any] = []
 
 
 def has_egl() -> bool:
-    """Whether the EGL library can be loaded (Linux only)."""
+    """Whether EGL can be loaded, and OpenGL beside it as PyOpenGL looks for it (Linux only)."""
     if not sys.platform.startswith("linux"):
         return False
     try:
         ctypes.CDLL("libEGL.so.1")
     except OSError:
         return False
-    return True
+    return any(ctypes.util.find_library(name) for name in ("OpenGL", "GL"))
 
 
 def choose_backend() -> str:
@@ -175,7 +176,7 @@ def _gl_context(width: int, height: int) -> Any:
     on_linux = sys.platform.startswith("linux")
     if on_linux and backend in ("", "egl", "disabled") and not has_egl():
         raise RuntimeError(
-            f"cannot render: the EGL library (libEGL.so.1) is missing. On Debian or Ubuntu run: {REMEDY}"
+            f"cannot render: EGL (libEGL.so.1) or OpenGL (libOpenGL.so.0) is missing. On Debian or Ubuntu run: {REMEDY}"
         )
     try:
         if on_linux and backend in ("", "egl"):
