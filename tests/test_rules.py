@@ -62,10 +62,15 @@ def test_timer_is_the_best_delay_on_calibrate(arming: Any) -> None:
         chosen = random_calibration(seed, arming)
         panel = chosen.panel
         found = calibrated("timer", chosen)
-        delays = [*range(0, HORIZON, DELAY_STEP), HORIZON]
-        earned = [panel.returns(panel.executed(np.minimum(panel.arming_step + k, HORIZON))).mean() for k in delays]
-        assert found.threshold in delays and found.tuning_episodes == len(delays) * len(panel)
-        assert panel.returns(panel.handover_of(found.rule)).mean() == pytest.approx(max(earned))
+        coarse = [*range(0, HORIZON, DELAY_STEP), HORIZON]
+        earned = [
+            panel.returns(panel.executed(np.minimum(panel.arming_step + k, HORIZON))).mean() for k in range(HORIZON + 1)
+        ]
+        best = max(coarse, key=lambda delay: earned[delay])
+        around = range(max(best - DELAY_STEP + 1, 0), min(best + DELAY_STEP, HORIZON + 1))
+        assert panel.returns(panel.handover_of(found.rule)).mean() == pytest.approx(max(earned[k] for k in around))
+        assert found.threshold in around
+        assert found.tuning_episodes == len({*coarse, *around}) * len(panel)
 
 
 @pytest.mark.parametrize("arming", ARMINGS)

@@ -33,6 +33,7 @@ from safeswitch.expert.cart_pole_model import SWINGS, SwingCandidates, dynamics,
 from safeswitch.expert.codegen import FLAGS, find_compiler, source
 from safeswitch.expert.ddp import DDPSolver, Problem, Solution, make_solver
 from safeswitch.expert.graph import expanded
+from safeswitch.perf_handover import handover_benchmark
 from safeswitch.tasks.cart_pole import CartPoleConfig
 
 Array = NDArray[np.float64]
@@ -287,9 +288,11 @@ def action_functions(problem: Problem) -> list[ca.Function]:
 
 
 def main() -> None:
-    """Print `expert_benchmark`."""
-    for name, value in expert_benchmark().items():
-        print(f"{name:28s} {value:.6g}" if isinstance(value, float) else f"{name:28s} {value}")
+    """Print both benchmarks."""
+    for title, results in (("expert", expert_benchmark()), ("handover table", handover_benchmark())):
+        print(f"--- {title}")
+        for name, value in results.items():
+            print(f"{name:28s} {value:.6g}" if isinstance(value, float) else f"{name:28s} {value}")
 
 
 if __name__ == "__main__":

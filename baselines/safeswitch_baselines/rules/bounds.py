@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from safeswitch.handover.episode import NeverSwitch
-from safeswitch.handover.panel import DELAY_STEP, PHI, Calibration, Panel
+from safeswitch.handover.panel import PHI, Calibration, Panel
 from safeswitch.handover.table import Ints
 from safeswitch.protocols import Calibrated
 from safeswitch_baselines.rules.base import DelayRule, PlainMethod, SignalMethod, ThresholdRule
@@ -34,7 +34,7 @@ class ExpertOnly(PlainMethod):
 class Timer(PlainMethod):
     """`timer`: the best single delay after the arming step on the calibrate episodes, whatever the signals say.
 
-    Delays are tried on every calibrate episode, at the resolution of `Panel.best_delay`.
+    Delays are tried on every calibrate episode, coarse ones first (`Panel.best_delay`).
     """
 
     family = "timer"
@@ -43,9 +43,8 @@ class Timer(PlainMethod):
     def calibrate(self, calibration: Calibration) -> Calibrated:
         """Best mean return over all delays."""
         panel = calibration.panel
-        delay = panel.best_delay(calibration.phi)
-        episodes = (-(-panel.table.horizon // DELAY_STEP) + 1) * len(panel)  # every multiple below T, and T itself
-        return Calibrated(DelayRule(delay), threshold=float(delay), tuning_episodes=episodes)
+        delay, tried = panel.best_delay(calibration.phi)
+        return Calibrated(DelayRule(delay), threshold=float(delay), tuning_episodes=tried * len(panel))
 
 
 class _AtOnset:

@@ -17,7 +17,7 @@ PHI = 5.0
 """Reward of success in the headline, in units of a whole episode driven by the learner (DESIGN section 2)."""
 
 DELAY_STEP = 5
-"""Resolution of the timer [steps]."""
+"""Resolution of the timer's first search [steps]; the second one has a resolution of one step."""
 
 
 @dataclass(frozen=True)
@@ -153,18 +153,28 @@ class Panel:
         """R0: the best mean return without any signal, of the learner, the expert, or the best delay (timer)."""
         horizon = self.table.horizon
         never = np.full(len(self), horizon)
-        delayed = self.executed(np.minimum(self.arming_step + self.best_delay(phi), horizon))
+        delayed = self.executed(np.minimum(self.arming_step + self.best_delay(phi)[0], horizon))
         choices = (never, self.executed(self.arming_step), delayed)
         return max(float(self.returns(handover, phi).mean()) for handover in choices)
 
-    def best_delay(self, phi: float = PHI) -> int:
+    def best_delay(self, phi: float = PHI) -> tuple[int, int]:
         """Delay after the arming step [steps] with the highest mean return when every episode hands over after it.
 
-        Delays are multiples of `DELAY_STEP`, and T (never).
+        Delays at multiples of `DELAY_STEP` and T (never) are tried first, then every delay around the best of them.
+
+        Returns:
+            The delay, and how many delays were tried.
         """
-        delays = np.append(np.arange(0, self.table.horizon, DELAY_STEP), self.table.horizon)
+        horizon = self.table.horizon
+        coarse = np.append(np.arange(0, horizon, DELAY_STEP), horizon)
+        best = int(coarse[np.argmax(self._delayed_returns(coarse, phi))])
+        near = np.arange(max(best - DELAY_STEP + 1, 0), min(best + DELAY_STEP, horizon + 1))
+        return int(near[np.argmax(self._delayed_returns(near, phi))]), len(np.union1d(coarse, near))
+
+    def _delayed_returns(self, delays: Ints, phi: float) -> Array:
+        """(n,) mean return of handing every episode over so many steps after its arming step."""
         handover = self.executed(np.minimum(self.arming_step + delays[:, None], self.table.horizon))
-        return int(delays[np.argmax(self.returns(handover, phi).mean(axis=1))])
+        return self.returns(handover, phi).mean(axis=1)
 
 
 @dataclass(frozen=True)
