@@ -40,7 +40,8 @@ class Run:
         profile: how much is run.
         store: where finished work is kept.
         workers: processes at a time; the results do not depend on it.
-        seconds: wall time spent in each stage by this run.
+        seconds: wall time spent in each stage by this run [s]; next to nothing where the work was done before.
+        work: time that the jobs of each stage took when they were run, added up over workers [s].
     """
 
     task: Task
@@ -48,6 +49,7 @@ class Run:
     store: Store
     workers: int = 2
     seconds: dict[str, float] = field(default_factory=dict)
+    work: dict[str, float] = field(default_factory=dict)
 
     @cached_property
     def demonstrations(self) -> Job:
@@ -175,6 +177,7 @@ class Run:
                 for label in done:
                     progress.advance(label)
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - started
+        self.work[stage] = sum(self.store.recipe(job.key)["seconds"] for job in jobs)
 
 
 def run_job(root: str, job: Job) -> str:

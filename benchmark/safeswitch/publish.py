@@ -162,7 +162,10 @@ def _manifest(run: Run, folder: Path, commit: str, seconds: float) -> dict[str, 
         "learner_seeds": list(range(run.profile.learners)),
         "episodes": {"calibrate": run.profile.calibrate, "test": run.profile.test},
         "episode_seeds": {split: index * SPLIT_SIZE for index, split in enumerate(SPLITS)},
-        "stage_seconds": {name: round(value, 1) for name, value in run.seconds.items()},
+        "stage_seconds": {
+            name: {"wall, this run": round(wall, 1), "work, when computed": round(run.work[name], 1)}
+            for name, wall in run.seconds.items()
+        },
         "wall_seconds": round(seconds, 1),
         "store_keys": {"demonstrations": run.demonstrations.key, "scores": run.scores.key},
         "sha256": {f"{name}.csv": _sha(run.store.folder(run.scores.key) / f"{name}.csv") for name in TABLES},
