@@ -1,4 +1,4 @@
-"""How fast thresholds are scored from the handover table, beside plain episodes in the same run; and a decision's time."""
+"""How fast thresholds are scored from the handover table, beside plain episodes in the same run; a decision's time."""
 
 from __future__ import annotations
 

@@ -186,10 +186,16 @@ class Profile:
 
 PROFILES: dict[str, Profile] = {
     "smoke": Profile(
-        "smoke", 1, 2, 4, 4, demonstrations={"episodes": 12}, learner_options={"hidden": (64, 64), "epochs": 20, "dropout": 0.1}
+        "smoke",
+        learners=1,
+        cells=2,
+        calibrate=4,
+        test=4,
+        demonstrations={"episodes": 12},
+        learner_options={"hidden": (64, 64), "epochs": 20},
     ),
-    "standard": Profile("standard", 1, 3, 100, 100),
-    "full": Profile("full", 5, None, 40, 40, give_back_cells=3, tables=True),
+    "standard": Profile("standard", learners=1, cells=3, calibrate=100, test=100),
+    "full": Profile("full", learners=5, cells=None, calibrate=40, test=40, give_back_cells=3, tables=True),
 }
 
 
