@@ -23,10 +23,13 @@ if TYPE_CHECKING:
     from safeswitch.stages import CellTables
     from safeswitch.suite import Cell, Task
 
-RULE = "cem@total"
-"""The paper's rule, of which the pictures are."""
-
 SIGNAL = "total"
+"""The paper's signal, of which the film and the episode's figure are."""
+
+RULE = f"cem@{SIGNAL}"
+
+LEARNING_SIGNALS = (SIGNAL, "epistemic")
+"""Signals for which CEM's learning is drawn: the paper's, and the one that also works from the start."""
 
 
 def draw(folder: Path, root: str, task: Task, learner: str, episodes: str, tables: CellTables, scores: str) -> None:
@@ -40,7 +43,8 @@ def draw(folder: Path, root: str, task: Task, learner: str, episodes: str, table
     table = read_csv(store.folder(scores) / "leaderboard.csv")
     for protocol in stages.protocols_of(cell):
         calibration = stages.calibration_of(loaded, task, cell, protocol, seed=0)
-        _draw_cem(calibration.panel, rows, logs, protocol, cell, target)
+        for signal in LEARNING_SIGNALS:
+            _draw_cem(calibration.panel, rows, logs, protocol, cell, signal, target)
         _draw_sweep(stages.test_panel(loaded, cell, protocol), rows, protocol, cell, target)
         place = (cell.disturbance, cell.severity)
         figures.figure_plane(table, task.name, place, protocol, target / f"plane-{protocol}.png")
@@ -53,16 +57,17 @@ def _threshold(rows: pd.DataFrame, protocol: str, method: str = RULE) -> float:
 
 
 def _draw_cem(
-    panel: Panel, rows: pd.DataFrame, logs: dict[str, Any], protocol: Arming, cell: Cell, target: Path
+    panel: Panel, rows: pd.DataFrame, logs: dict[str, Any], protocol: Arming, cell: Cell, signal: str, target: Path
 ) -> None:
-    prefix = f"{protocol}|{RULE}|"
+    rule = f"cem@{signal}"
+    prefix = f"{protocol}|{rule}|"
     log = {name.removeprefix(prefix): value for name, value in logs.items() if name.startswith(prefix)}
     figures.figure_cem(
         log,
-        panel.margins(SIGNAL),
-        _threshold(rows, protocol),
-        target / f"cem-{protocol}.png",
-        f"{RULE} in {cell}, armed at {protocol}",
+        panel.margins(signal),
+        _threshold(rows, protocol, rule),
+        target / f"cem-{signal}-{protocol}.png",
+        f"{rule} in {cell}, armed at {protocol}",
     )
 
 
@@ -72,8 +77,9 @@ def _draw_sweep(panel: Panel, rows: pd.DataFrame, protocol: Arming, cell: Cell, 
         name: panel.returns(panel.handover_at(name, thresholds)).mean(axis=1) for name in panel.table.signals
     }
     marks = {
-        f"{rule}@{SIGNAL}": _threshold(rows, protocol, f"{rule}@{SIGNAL}")
-        for rule in ("cem", "grid", "fixed-q99", "fixed-epmax95")
+        f"{rule}@{signal}": _threshold(rows, protocol, f"{rule}@{signal}")
+        for signal in LEARNING_SIGNALS
+        for rule in ("cem", "grid", "fixed-epmax95")
     }
     never = np.full(len(panel), panel.table.horizon)
     levels = {
