@@ -241,7 +241,7 @@ def test_wrong_arguments() -> None:
         env.reset(seed=0, options={"state": [0, 0, 0, 0]})
     with pytest.raises(ValueError, match="initial_state must be"):
         env.reset(seed=0, options={"initial_state": [0, 0, math.nan, 0]})
-    with pytest.raises(ValueError, match="step from 0 to 75, got 100"):
+    with pytest.raises(ValueError, match="step from 0 to 79, got 100"):
         env.reset(seed=0, options={"onset": 100})
 
 

@@ -120,8 +120,7 @@ def table_jobs(store: Store, task: Task, cell: Cell, split: Split, count: int, l
             "env": task.env_id,
             "cell": cell.env_kwargs,
             "split": split,
-            "first": first,
-            "count": size,
+            "seeds": episode_seeds(split, size, first),
             "signals": list(task.signals),
             "complete": cell.complete,
         }

@@ -63,6 +63,11 @@ class DelayRule:
         return Driver.EXPERT if step + 1 - self._start >= self.delay else Driver.LEARNER
 
 
+def expert_steps(panel: Panel, handover: Ints) -> int:
+    """Steps that the expert drives, added up over all episodes and candidates: what a search asks of the expert."""
+    return round(float(panel.expert_share(handover).sum()) * panel.table.horizon)
+
+
 class SignalMethod:
     """Base of methods on one signal; `family` is the part of the id before the `@`."""
 

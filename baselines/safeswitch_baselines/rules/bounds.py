@@ -8,7 +8,7 @@ from safeswitch.handover.episode import NeverSwitch
 from safeswitch.handover.panel import PHI, Calibration, Panel
 from safeswitch.handover.table import Ints
 from safeswitch.protocols import Calibrated
-from safeswitch_baselines.rules.base import DelayRule, PlainMethod, SignalMethod, ThresholdRule
+from safeswitch_baselines.rules.base import DelayRule, PlainMethod, SignalMethod, ThresholdRule, expert_steps
 
 
 class LearnerOnly(PlainMethod):
@@ -44,7 +44,8 @@ class Timer(PlainMethod):
         """Best mean return over all delays."""
         panel = calibration.panel
         delay, tried = panel.best_delay(calibration.phi)
-        return Calibrated(DelayRule(delay), threshold=float(delay), tuning_episodes=tried * len(panel))
+        queries = expert_steps(panel, panel.delayed(tried))
+        return Calibrated(DelayRule(delay), float(delay), len(tried) * len(panel), queries)
 
 
 class _AtOnset:

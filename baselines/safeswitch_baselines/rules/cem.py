@@ -19,7 +19,7 @@ import numpy as np
 from safeswitch.handover.panel import Calibration, Panel
 from safeswitch.protocols import Arming, Array, Calibrated
 from safeswitch.seeding import stream
-from safeswitch_baselines.rules.base import SignalMethod, ThresholdRule
+from safeswitch_baselines.rules.base import SignalMethod, ThresholdRule, expert_steps
 
 
 @dataclass(frozen=True)
@@ -81,11 +81,14 @@ def learn_threshold(panel: Panel, signal: str, settings: CEMSettings, seed: int,
     sigma = settings.sigma * (settings.mu if settings.linear else 1.0)
     floor = settings.floor * (settings.mu if settings.linear else 1.0)
     rows: list[tuple[Array, Array, Array, float, float, bool]] = []
-    accepted = repeats = 0
+    accepted = repeats = queries = 0
     while accepted < settings.iterations:
         draws = rng.normal(mu, sigma, settings.candidates)
         thresholds = draws if settings.linear else np.exp(draws)
-        returns, success = _score(episodes.draw(), signal, thresholds, phi)
+        sample = episodes.draw()
+        handover = sample.handover_at(signal, thresholds)
+        returns, success = sample.returns(handover, phi).mean(axis=1), sample.success(handover).mean(axis=1)
+        queries += expert_steps(sample, handover)
         enough = int(np.sum(success >= SUCCESS_SHARE)) >= settings.successes
         if enough or repeats >= settings.repeats:
             elite = draws[np.argsort(-returns, kind="stable")[: settings.elites]]
@@ -98,9 +101,8 @@ def learn_threshold(panel: Panel, signal: str, settings: CEMSettings, seed: int,
     log = _as_arrays(rows)
     last = log["mu"][-settings.average :].mean()
     threshold = float(last if settings.linear else np.exp(last))
-    return Calibrated(
-        ThresholdRule(signal, threshold), threshold, len(rows) * settings.candidates * settings.episodes, log=log
-    )
+    cost = len(rows) * settings.candidates * settings.episodes
+    return Calibrated(ThresholdRule(signal, threshold), threshold, cost, queries, log)
 
 
 class _EpisodeSampler:
@@ -123,11 +125,6 @@ class _EpisodeSampler:
             self.queues[group] = np.concatenate([self.queues[group], fresh])
         chosen, self.queues[group] = np.split(self.queues[group], [count])
         return chosen
-
-
-def _score(panel: Panel, signal: str, thresholds: Array, phi: float) -> tuple[Array, Array]:
-    handover = panel.handover_at(signal, thresholds)
-    return panel.returns(handover, phi).mean(axis=1), panel.success(handover).mean(axis=1)
 
 
 def _as_arrays(rows: list[tuple[Array, Array, Array, float, float, bool]]) -> dict[str, np.ndarray]:

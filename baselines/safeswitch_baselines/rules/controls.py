@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import brentq
@@ -68,7 +69,7 @@ class RandomControl(PlainMethod):
             return float(np.mean([_expected_share(hazard, int(steps)) for steps in armed])) - share
 
         hazard = 0.0 if share <= 0 else 1.0 if excess(1.0) <= 0 else float(brentq(excess, 0.0, 1.0))
-        return Calibrated(RandomRule(hazard), hazard, reference.tuning_episodes)
+        return Calibrated(RandomRule(hazard), hazard, reference.tuning_episodes, reference.expert_queries)
 
 
 def _expected_share(hazard: float, steps: int) -> float:
@@ -110,7 +111,7 @@ class PeriodicControl(PlainMethod):
         """Burst length to the nearest step."""
         share, reference = reference_share(calibration)
         burst = round(share * PERIOD)
-        return Calibrated(PeriodicRule(burst), float(burst), reference.tuning_episodes)
+        return Calibrated(PeriodicRule(burst), float(burst), reference.tuning_episodes, reference.expert_queries)
 
 
 class _Shuffled:
@@ -136,7 +137,7 @@ class Shuffled(SignalMethod):
             Calibration(panel, calibration.nominal, calibration.phi, calibration.seed)
         )
         rule = _Shuffled(self.signal, learned.threshold)
-        return Calibrated(rule, learned.threshold, learned.tuning_episodes, log=learned.log)
+        return replace(learned, rule=rule)
 
 
 def shuffled(panel: Panel, signal: str) -> Panel:

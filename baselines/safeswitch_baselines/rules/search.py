@@ -7,7 +7,7 @@ import numpy as np
 from safeswitch.handover.panel import Calibration, Panel
 from safeswitch.protocols import Array, Calibrated
 from safeswitch.seeding import stream
-from safeswitch_baselines.rules.base import SignalMethod, ThresholdRule
+from safeswitch_baselines.rules.base import SignalMethod, ThresholdRule, expert_steps
 from safeswitch_baselines.rules.cem import CEM
 
 CANDIDATES = 32
@@ -34,11 +34,13 @@ class Search(SignalMethod):
         rng = stream(calibration.seed, self.family, self.signal, panel.arming)
         thresholds = np.sort(self.candidates(settings.mu, settings.sigma, rng))
         sample = _common_episodes(panel, budget // len(thresholds), rng)
-        returns = sample.returns(sample.handover_at(self.signal, thresholds), calibration.phi).mean(axis=1)
+        handover = sample.handover_at(self.signal, thresholds)
+        returns = sample.returns(handover, calibration.phi).mean(axis=1)
         best = np.flatnonzero(returns == returns.max())
         threshold = float(thresholds[best[len(best) // 2]])
         log = {"samples": thresholds, "sample_return": returns}
-        return Calibrated(ThresholdRule(self.signal, threshold), threshold, budget, log=log)
+        rule = ThresholdRule(self.signal, threshold)
+        return Calibrated(rule, threshold, budget, expert_steps(sample, handover), log)
 
 
 class GridSearch(Search):

@@ -153,28 +153,30 @@ class Panel:
         """R0: the best mean return without any signal, of the learner, the expert, or the best delay (timer)."""
         horizon = self.table.horizon
         never = np.full(len(self), horizon)
-        delayed = self.executed(np.minimum(self.arming_step + self.best_delay(phi)[0], horizon))
+        delayed = self.delayed(np.array([self.best_delay(phi)[0]]))[0]
         choices = (never, self.executed(self.arming_step), delayed)
         return max(float(self.returns(handover, phi).mean()) for handover in choices)
 
-    def best_delay(self, phi: float = PHI) -> tuple[int, int]:
+    def best_delay(self, phi: float = PHI) -> tuple[int, Ints]:
         """Delay after the arming step [steps] with the highest mean return when every episode hands over after it.
 
         Delays at multiples of `DELAY_STEP` and T (never) are tried first, then every delay around the best of them.
 
         Returns:
-            The delay, and how many delays were tried.
+            The delay, and all delays that were tried, increasing.
         """
         horizon = self.table.horizon
         coarse = np.append(np.arange(0, horizon, DELAY_STEP), horizon)
-        best = int(coarse[np.argmax(self._delayed_returns(coarse, phi))])
+        best = int(coarse[self._best_of(coarse, phi)])
         near = np.arange(max(best - DELAY_STEP + 1, 0), min(best + DELAY_STEP, horizon + 1))
-        return int(near[np.argmax(self._delayed_returns(near, phi))]), len(np.union1d(coarse, near))
+        return int(near[self._best_of(near, phi)]), np.union1d(coarse, near)
 
-    def _delayed_returns(self, delays: Ints, phi: float) -> Array:
-        """(n,) mean return of handing every episode over so many steps after its arming step."""
-        handover = self.executed(np.minimum(self.arming_step + delays[:, None], self.table.horizon))
-        return self.returns(handover, phi).mean(axis=1)
+    def delayed(self, delays: NDArray[np.integer]) -> Ints:
+        """(n, E) handover step of handing every episode over n delays after its arming step; T where it has ended."""
+        return self.executed(np.minimum(self.arming_step + np.asarray(delays)[:, None], self.table.horizon))
+
+    def _best_of(self, delays: Ints, phi: float) -> int:
+        return int(np.argmax(self.returns(self.delayed(delays), phi).mean(axis=1)))
 
 
 @dataclass(frozen=True)

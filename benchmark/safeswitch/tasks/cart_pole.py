@@ -27,7 +27,7 @@ CONTROL_DT = 0.06
 """Control period [s]. At 0.04 s and below, the gains of a good learner stay stable on the lighter cart."""
 TIMESTEP = 0.02
 """Time step of the simulation [s], RK4."""
-HORIZON = 76
+HORIZON = 80
 """T, control steps of an episode. With onsets on 10-60 % of it, half of the disturbances meet the swing-up."""
 RAIL = 1.5
 """Half the length of the rail [m]; leaving it ends the episode."""
@@ -173,7 +173,7 @@ class CartPoleEnv(TaskEnv):
     ## Start, end, success
 
     The pole hangs (theta = pi +- 0.1 rad) beside the middle (x = 0.5 +- 0.2 m) almost at rest. The episode
-    *terminates* when the cart leaves the rail, which is a failure, and is *truncated* after T = 76 steps of 0.06 s. It
+    *terminates* when the cart leaves the rail, which is a failure, and is *truncated* after T = 80 steps of 0.06 s. It
     is a success if |theta| < 12 deg in every control step of the last second, on the rail.
 
     ## Info (the same keys at reset and at every step)
