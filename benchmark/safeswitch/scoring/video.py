@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import imageio.v2 as imageio
 import numpy as np
@@ -52,10 +52,12 @@ def replay_frames(env: TaskEnv, episode: Episode, caption: str) -> list[NDArray[
 
 
 def write_side_by_side(panels: Sequence[list[NDArray[np.uint8]]], path: Path, fps: int) -> None:
-    """Write panels beside one another as an .mp4; a panel that ends early keeps its last frame."""
+    """Write panels beside one another as .mp4 or .gif; a panel that ends early keeps its last frame."""
     count = max(len(frames) for frames in panels)
     hold = fps  # one second on the last frame, so that the verdict can be read
-    with imageio.get_writer(path, fps=fps, codec="libx264", quality=6, macro_block_size=2) as writer:
+    film = {"fps": fps, "codec": "libx264", "quality": 6, "macro_block_size": 2}
+    options: dict[str, Any] = {"duration": 1000 / fps} if path.suffix == ".gif" else film
+    with imageio.get_writer(path, **options) as writer:
         for index in range(count + hold):
             writer.append_data(np.concatenate([frames[min(index, len(frames) - 1)] for frames in panels], axis=1))
 
