@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +11,9 @@ import pandas as pd
 from safeswitch import registry, stages
 from safeswitch.files import load_arrays, load_frame
 from safeswitch.handover.episode import Episode, NeverSwitch, run_episode
-from safeswitch.handover.panel import Panel
-from safeswitch.protocols import Arming, Driver
+from safeswitch.handover.panel import Calibration, Panel
+from safeswitch.handover.table import HandoverTable
+from safeswitch.protocols import Arming
 from safeswitch.scoring import figures
 from safeswitch.scoring.leaderboard import read_csv
 from safeswitch.scoring.video import replay_frames, write_side_by_side
@@ -48,7 +48,8 @@ def draw(folder: Path, root: str, task: Task, learner: str, episodes: str, table
         _draw_sweep(stages.test_panel(loaded, cell, protocol), rows, protocol, cell, target)
         place = (cell.disturbance, cell.severity)
         figures.figure_plane(table, task.name, place, protocol, target / f"plane-{protocol}.png")
-    _draw_episode(task, cell, learner, loaded["test"], rows, target)
+    calibration = stages.calibration_of(loaded, task, cell, "onset", seed=0)
+    _draw_episode(task, cell, learner, loaded["test"], calibration, rows, target)
 
 
 def _threshold(rows: pd.DataFrame, protocol: str, method: str = RULE) -> float:
@@ -91,7 +92,15 @@ def _draw_sweep(panel: Panel, rows: pd.DataFrame, protocol: Arming, cell: Cell, 
     )
 
 
-def _draw_episode(task: Task, cell: Cell, learner: str, table: Any, rows: pd.DataFrame, target: Path) -> None:
+def _draw_episode(
+    task: Task,
+    cell: Cell,
+    learner: str,
+    table: HandoverTable,
+    calibration: Calibration,
+    rows: pd.DataFrame,
+    target: Path,
+) -> None:
     """The first test episode that the learner fails and the rule saves: its signals, and a film of three drivers."""
     chosen = rows[(rows["protocol"] == "onset") & (rows["method"] == RULE)]
     saved = chosen[chosen["success"] & ~chosen["learner_success"]]
@@ -101,8 +110,8 @@ def _draw_episode(task: Task, cell: Cell, learner: str, table: Any, rows: pd.Dat
     env = stages.make_env(task, cell)
     drivers: dict[str, tuple[Any, Arming]] = {
         "learner": (NeverSwitch(), "start"),
-        RULE: (_Threshold(threshold), "onset"),
-        "expert": (_Threshold(-np.inf, Driver.EXPERT), "start"),
+        RULE: (registry.make_method(RULE).calibrate(calibration).rule, "onset"),
+        "expert": (registry.make_method("expert").calibrate(calibration).rule, "start"),
     }
     runs = {name: _drive(task, env, learner, rule, seed, arming) for name, (rule, arming) in drivers.items()}
     figures.figure_episode(
@@ -120,24 +129,6 @@ def _draw_episode(task: Task, cell: Cell, learner: str, table: Any, rows: pd.Dat
     panels = [replay_frames(film, episode, name) for name, episode in runs.items()]
     write_side_by_side(panels, target / "episode.mp4", round(1 / env.control_dt))
     film.close()
-
-
-class _Threshold:
-    """The paper's latched rule, with the driver it starts with: enough to drive the film."""
-
-    def __init__(self, threshold: float, first: Driver = Driver.LEARNER):
-        self.threshold, self.first = threshold, first
-
-    def reset(self, seed: int) -> None:
-        self.driver = self.first
-
-    def arm(self, step: int) -> Driver:
-        return self.driver
-
-    def update(self, step: int, signals: Mapping[str, float]) -> Driver:
-        if signals[SIGNAL] > self.threshold:
-            self.driver = Driver.EXPERT
-        return self.driver
 
 
 def _drive(task: Task, env: Any, learner: str, rule: Any, seed: int, arming: Arming) -> Episode:

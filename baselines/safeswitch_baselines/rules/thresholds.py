@@ -54,18 +54,9 @@ class FixedEpisodeMax95(SignalMethod):
 
 
 class FixedValue(SignalMethod):
-    """`fixed-0.1@` and so on: an absolute value in the signal's units, set by hand without any data."""
+    """An absolute value in the signal's units, set by hand without any data."""
 
-    family = "fixed"
-
-    def __init__(self, signal: str | None, value: float):
-        super().__init__(signal)
-        self.value = value
-
-    @property
-    def id(self) -> str:
-        """`fixed-<value>@signal`."""
-        return f"fixed-{self.value:g}@{self.signal}"
+    value: ClassVar[float]
 
     def calibrate(self, calibration: Calibration) -> Calibrated:
         """Nothing to choose."""
@@ -73,28 +64,24 @@ class FixedValue(SignalMethod):
 
 
 class Fixed005(FixedValue):
-    """5 % of the largest action."""
+    """`fixed-0.05@`: 5 % of the largest action."""
 
-    def __init__(self, signal: str | None):
-        super().__init__(signal, 0.05)
+    family, value = "fixed-0.05", 0.05
 
 
 class Fixed01(FixedValue):
-    """10 % of the largest action."""
+    """`fixed-0.1@`: 10 % of the largest action."""
 
-    def __init__(self, signal: str | None):
-        super().__init__(signal, 0.1)
+    family, value = "fixed-0.1", 0.1
 
 
 class Fixed02(FixedValue):
-    """20 % of the largest action."""
+    """`fixed-0.2@`: 20 % of the largest action."""
 
-    def __init__(self, signal: str | None):
-        super().__init__(signal, 0.2)
+    family, value = "fixed-0.2", 0.2
 
 
 class Fixed04(FixedValue):
-    """40 % of the largest action."""
+    """`fixed-0.4@`: 40 % of the largest action."""
 
-    def __init__(self, signal: str | None):
-        super().__init__(signal, 0.4)
+    family, value = "fixed-0.4", 0.4
