@@ -16,6 +16,7 @@ __version__ = "0.1.0"
 
 ENTRY_POINTS: dict[str, str] = {
     "SafeSwitch/CartPole-v0": "safeswitch.tasks.cart_pole:CartPoleEnv",
+    "SafeSwitch/CartPoleImage-v0": "safeswitch.tasks.cart_pole_image:CartPoleImageEnv",
 }
 """Environment id -> where its class is, imported when the environment is made."""
 

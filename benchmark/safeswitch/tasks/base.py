@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from safeswitch.protocols import Expert
 from safeswitch.seeding import stream
-from safeswitch.tasks import checks
+from safeswitch.tasks import checks, visual  # noqa: F401  (registers the disturbances of images)
 from safeswitch.tasks.disturbances import Disturbance, make_disturbance
 from safeswitch.tasks.rendering import Image, Renderer
 from safeswitch.tasks.simulator import Simulator
@@ -199,8 +199,16 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
             return None
         if self._renderer is None:
             self._renderer = Renderer(self.simulator.nominal, self.width, self.height, self.camera)
-        self.simulator.update_kinematics(self.simulator.model)
-        return self._renderer.render(self.simulator.model, self.simulator.data)
+        return self._draw(self._renderer, self.disturbance if self.disturbed else None)
+
+    def _draw(self, renderer: Renderer, disturbance: Disturbance | None) -> Image:
+        """Picture of the current state, with the looks of the `disturbance` in force."""
+        model = self.simulator.nominal
+        if disturbance is not None and self._onset is not None:
+            model = self.simulator.disturbed
+            disturbance.show(model, self._step_index - self._onset)
+        self.simulator.update_kinematics(model)
+        return renderer.render(model, self.simulator.data)
 
     def close(self) -> None:
         """Free the renderer; the physics keeps working and `render` makes a new one."""

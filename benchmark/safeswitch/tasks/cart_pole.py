@@ -8,7 +8,10 @@ design split, such that the drop defeats a learner and not the expert, and were 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
+from types import MappingProxyType
+from typing import Any, ClassVar
 
 import gymnasium as gym
 import mujoco
@@ -210,6 +213,8 @@ class CartPoleEnv(TaskEnv):
         "force_limit",
     )
     camera = "side"
+    defaults: ClassVar[Mapping[str, float]] = MappingProxyType({})
+    """Numbers of `CartPoleConfig` in which a task differs from it."""
     metadata = {"render_modes": ["rgb_array"], "render_fps": round(1.0 / CONTROL_DT)}  # noqa: RUF012
 
     def __init__(
@@ -222,9 +227,9 @@ class CartPoleEnv(TaskEnv):
         **design: float,
     ) -> None:
         """See the class docstring."""
-        self.config = CartPoleConfig.of(**design)
+        self.config = CartPoleConfig.of(**{**self.defaults, **design})
         super().__init__(
-            models.cart_pole(self.config),
+            self._compiled(),
             arguments={
                 "disturbance": disturbance,
                 "severity": severity,
@@ -244,6 +249,10 @@ class CartPoleEnv(TaskEnv):
         self._high = high.astype(np.float64)
         self.observation_space = gym.spaces.Box(-high, high, dtype=np.float32)
         self.action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def _compiled(self) -> mujoco.MjModel:
+        """The model that is simulated and drawn."""
+        return models.cart_pole(self.config)
 
     def make_expert(self) -> Expert:
         """Model-predictive expert that knows the full state and the current parameters."""
@@ -290,7 +299,7 @@ class CartPoleEnv(TaskEnv):
         reward = 0.5 * (1.0 + math.cos(theta)) * (1.0 - (x / self.config.rail) ** 2)
         return min(max(reward, 0.0), 1.0)
 
-    def _observe(self, disturbance: Disturbance | None) -> NDArray[np.float32]:
+    def _observe(self, disturbance: Disturbance | None) -> NDArray[Any]:
         observation = self._read_state()
         if disturbance is not None:
             observation = disturbance.sense(observation, self._step_index)

@@ -1,10 +1,11 @@
 """Disturbances: what changes at the onset step t0, with a severity from 1 to 5.
 
 A disturbance is a pure function of what it draws at reset and of the step index. It owns no other state, so that an
-episode restored from a snapshot meets exactly the same disturbance. It may act in three ways:
+episode restored from a snapshot meets exactly the same disturbance. It may act in four ways:
 
 * `alter` writes into a *second* copy of the model, which takes over at t0 (the nominal one is never touched);
 * `force` is a generalised force applied during the steps from t0 on;
+* `show` moves what is only seen, in the same second copy, from step to step;
 * `sense` changes what is observed, not what is.
 
 To add one, subclass `Disturbance` and decorate it with `@offer`.
@@ -12,7 +13,7 @@ To add one, subclass `Disturbance` and decorate it with `@offer`.
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import mujoco
 import numpy as np
@@ -68,7 +69,10 @@ class Disturbance:
         """Generalised force (nv,) [N or N m] during step t0 + `elapsed`; None for none."""
         return None
 
-    def sense(self, observation: Array, step: int) -> Array:
+    def show(self, model: mujoco.MjModel, elapsed: int) -> None:
+        """Write what is seen at step t0 + `elapsed` into `model`, before it is drawn; nothing that the physics uses."""
+
+    def sense(self, observation: NDArray[Any], step: int) -> NDArray[Any]:
         """What is observed at `step` instead of `observation`, before it is clipped into the observation space."""
         return observation
 
@@ -233,7 +237,7 @@ class SensorBias(Disturbance):
         """Draw the sign."""
         self._bias = self.value * float(rng.choice((-1.0, 1.0)))
 
-    def sense(self, observation: Array, step: int) -> Array:
+    def sense(self, observation: NDArray[Any], step: int) -> NDArray[Any]:
         """Add the bias to the angle."""
         observation = observation.copy()
         observation[self.ANGLE] += self._bias
@@ -255,7 +259,7 @@ class SensorNoise(Disturbance):
         """Draw the noise of every step."""
         self._noise = self.value * self.SCALE * rng.standard_normal((horizon + 1, self.SCALE.size))
 
-    def sense(self, observation: Array, step: int) -> Array:
+    def sense(self, observation: NDArray[Any], step: int) -> NDArray[Any]:
         """Add the noise of this step."""
         return observation + self._noise[step]
 

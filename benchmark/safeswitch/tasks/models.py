@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 RAIL_LEG_INSET = 0.2
 """Distance of the legs from the ends of the rail [m]; only for the eye."""
+ROD_RADIUS, BOB_RADIUS = 0.035, 0.09
+"""Of the pole as the image task draws it [m]: two and four and a half pixels wide."""
 
 
 def assets_folder() -> Path:
@@ -36,12 +38,16 @@ def assets_folder() -> Path:
 
 def compose(base: str, model: str = "common/scene.xml") -> Any:
     """MJCF tree of the scene `model` with the robot `base` merged into it, names kept; both relative to `assets`."""
+    scene = _part(model)
+    scene.include_copy(_part(base), override_attributes=True)
+    return scene
+
+
+def _part(path: str) -> Any:
+    """MJCF tree of one file below `assets`."""
     from dm_control import mjcf
 
-    folder = assets_folder()
-    scene = mjcf.from_path(str(folder / model))
-    scene.include_copy(mjcf.from_path(str(folder / base)), override_attributes=True)
-    return scene
+    return mjcf.from_path(str(assets_folder() / path))
 
 
 def compile_model(tree: Any) -> mujoco.MjModel:
@@ -53,6 +59,21 @@ def compile_model(tree: Any) -> mujoco.MjModel:
 @lru_cache(maxsize=64)
 def cart_pole(config: CartPoleConfig) -> mujoco.MjModel:
     """Compiled cart-pole with the numbers of `config`. Shared within the process: copy it before changing it."""
+    return compile_model(_cart_pole_tree(config))
+
+
+@lru_cache(maxsize=64)
+def cart_pole_image(config: CartPoleConfig) -> mujoco.MjModel:
+    """The same physics in a studio: a wall, props, a third-person camera, and a pole that 64 pixels can show."""
+    tree = _cart_pole_tree(config)
+    tree.include_copy(_part("cart_pole/studio.xml"))
+    rod, bob = tree.find("geom", "pole"), tree.find("geom", "bob")
+    rod.size = [ROD_RADIUS, rod.size[1]]
+    bob.size = [BOB_RADIUS]
+    return compile_model(tree)
+
+
+def _cart_pole_tree(config: CartPoleConfig) -> Any:
     tree = compose("cart_pole/cart_pole.xml")
     tree.option.timestep = config.timestep
 
@@ -67,7 +88,7 @@ def cart_pole(config: CartPoleConfig) -> mujoco.MjModel:
 
     _draw_pole(tree, config.pole_length)
     _draw_rail(tree, config.rail)
-    return compile_model(tree)
+    return tree
 
 
 def _draw_pole(tree: Any, length: float) -> None:
