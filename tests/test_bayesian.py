@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 import torch
 
+from safeswitch.demos import Demonstrations
 from safeswitch.protocols import Learner
-from safeswitch_baselines.learners.bayesian import CONFIG, WEIGHTS, BayesianLearner, MaskStream
+from safeswitch_baselines.learners.bayesian import BayesianLearner
+from safeswitch_baselines.learners.dropout import MaskStream
 from safeswitch_baselines.learners.networks import BayesianMLP, InputEncoding, MLPConfig
+from safeswitch_baselines.learners.storage import CONFIG, WEIGHTS
 
 OBSERVATIONS = np.random.default_rng(3).normal(size=(50, 4)).astype(np.float32)
 CONFIGS = {
@@ -42,7 +45,7 @@ def test_batched_samples_agree_with_a_loop_over_the_masks(name):
     config = CONFIGS[name]
     learner = make_learner(config)
     learner.reset(5)
-    stream = MaskStream(config)
+    stream = MaskStream(config.layout, config.samples)
     stream.reset(5)
     inputs = torch.from_numpy(learner.encoding(OBSERVATIONS[:1]).astype(np.float32))
     for step in (0, 3):
@@ -120,7 +123,7 @@ def test_masks_are_a_function_of_seed_and_step_alone():
 
 def test_masks_of_different_steps_do_not_overlap():
     config = MLPConfig(hidden=(64, 64), dropout=0.5, samples=16)
-    stream = MaskStream(config)
+    stream = MaskStream(config.layout, config.samples)
     masks = [np.concatenate([mask.ravel() for mask in stream.draw(step) if mask is not None]) for step in range(8)]
     agreement = np.corrcoef(np.array(masks, dtype=float)) - np.eye(8)
     assert np.abs(agreement).max() < 5 / np.sqrt(masks[0].size)
@@ -210,3 +213,12 @@ def test_wrong_observations_name_what_was_expected():
         learner.predict(np.array([0.0, np.nan, 0.0, 0.0]), 0)
     with pytest.raises(ValueError, match="step=-1"):
         learner.predict(OBSERVATIONS[0], -1)
+
+
+def test_features_of_demonstrations_are_those_of_the_decisions():
+    learner = make_learner()
+    demos = Demonstrations(OBSERVATIONS, np.zeros((50, 2)), np.repeat(np.arange(5), 10))
+    features = learner.features(demos)
+    assert features.shape == (50, 256) and features.dtype == np.float32
+    decisions = np.stack([learner.predict(observation, 0).features for observation in OBSERVATIONS])
+    np.testing.assert_allclose(features, decisions, rtol=1e-5, atol=1e-6)

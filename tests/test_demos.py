@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -12,7 +13,7 @@ import pytest
 
 import safeswitch
 from safeswitch import datasets, demos
-from safeswitch.datasets import METADATA, write
+from safeswitch.datasets import METADATA, EpisodeFrames, write
 from safeswitch.demos import Demonstrations, Noise, Rollout, collect, load, roll_out
 
 ENV = "SafeSwitch/CartPole-v0"
@@ -148,31 +149,66 @@ def test_progress_counts_the_demonstrations(tmp_path):
     assert seen == [(1, 2), (2, 2)]
 
 
-def test_images_are_kept_without_loss_and_compressed(tmp_path, monkeypatch):
+@pytest.fixture
+def pictures(tmp_path, monkeypatch):
+    """Rollouts with images (2, 41, 32, 32, 3), in a dataset of their own; the root, and Minari's view of it."""
     spec = gym.envs.registration.EnvSpec("Pictures-v0", f"{__name__}:Pictures")
     monkeypatch.setitem(sys.modules, __name__, sys.modules.get(__name__) or SimpleNamespace(Pictures=Pictures))
     monkeypatch.setitem(gym.registry, "Pictures-v0", spec)
     rng = np.random.default_rng(0)
     images = np.repeat(rng.integers(0, 255, (2, 4, 1, 3), np.uint8), 8, axis=1).repeat(32, axis=2)[:, None]
-    images = np.repeat(images, 41, axis=1)  # (2, 41, 32, 32, 3)
+    images = np.repeat(images, 41, axis=1)
+    images[:, :, 5, :, 0] = np.arange(41)[:, None]  # every frame differs
     rollouts = [
         Rollout(
             seed,
             True,
             images[seed],
-            np.zeros((40, 1), np.float32),
-            np.zeros((41, 1)),
-            np.zeros((41, 2)),
+            rng.uniform(-1, 1, (40, 1)).astype(np.float32),
+            rng.uniform(-1, 1, (41, 1)),
+            rng.normal(size=(41, 2)),
             np.zeros(40),
             np.zeros(40, bool),
-            np.zeros(40, bool),
+            np.arange(40) == 39,
         )
         for seed in range(2)
     ]
-    folder = write(rollouts, "Pictures-v0", "pictures/expert-v0", tmp_path, Noise())
-    data = load("pictures/expert-v0", tmp_path)
-    np.testing.assert_array_equal(data.observations, np.concatenate([images[0, :40], images[1, :40]]))
-    assert (folder / "data" / "main_data.hdf5").stat().st_size < images.nbytes / 4
+    write(rollouts, "Pictures-v0", "pictures/expert-v0", tmp_path, Noise())
+    with datasets.minari_root(tmp_path):
+        import minari
+
+        return rollouts, tmp_path, minari.load_dataset("pictures/expert-v0")
+
+
+def test_images_are_kept_without_loss_and_compressed(pictures):
+    rollouts, root, dataset = pictures
+    for rollout, episode in zip(rollouts, dataset.iterate_episodes(), strict=True):
+        np.testing.assert_array_equal(episode.observations, rollout.observations)
+        np.testing.assert_array_equal(episode.actions, rollout.actions)
+        np.testing.assert_array_equal(episode.infos["expert_action"], rollout.labels)
+        np.testing.assert_array_equal(episode.infos["state"], rollout.states)
+        np.testing.assert_array_equal(episode.truncations, rollout.truncated)
+    raw = sum(rollout.observations.nbytes for rollout in rollouts)
+    assert (root / "pictures/expert-v0/data/main_data.hdf5").stat().st_size < raw / 4
+    assert isinstance(dataset.recover_environment().unwrapped, Pictures)
+
+
+def test_images_stay_in_their_file_until_an_episode_is_asked_for(pictures):
+    rollouts, root, _ = pictures
+    data = load("pictures/expert-v0", root)
+    frames = data.observations
+    assert isinstance(frames, EpisodeFrames)
+    assert (len(data), frames.shape, frames.dtype, frames.ndim) == (80, (80, 32, 32, 3), np.uint8, 4)
+    assert len(pickle.dumps(data)) < 10_000, "the images travel with the demonstrations"
+    for index, rollout in enumerate(rollouts):
+        np.testing.assert_array_equal(data.episode(index), rollout.observations[:-1])
+        np.testing.assert_array_equal(data.actions[data.steps(index)], rollout.labels[:-1])
+    np.testing.assert_array_equal(np.asarray(frames), np.concatenate([each.observations[:-1] for each in rollouts]))
+
+
+def test_an_episode_of_vectors_is_its_rows(data):
+    for index in range(len(SEEDS)):
+        np.testing.assert_array_equal(data.episode(index), data.observations[data.episodes == index])
 
 
 def test_noise_has_the_promised_size_and_correlation():

@@ -12,6 +12,7 @@ from rich.console import Console
 
 from safeswitch import doctor
 from safeswitch.doctor import Check
+from safeswitch.tasks.opengl import describe_renderer
 
 
 def script(path: Path, body: str) -> str:
@@ -73,6 +74,16 @@ def test_a_driver_that_crashes_at_exit_has_still_rendered(monkeypatch: pytest.Mo
     )
     check = doctor.check_rendering()
     assert check.ok and "software" in check.detail
+    monkeypatch.setattr(doctor, "_RENDER", """print('{"detail": "NVIDIA A100", "renderer": "NVIDIA A100"}')""")
+    assert doctor.check_rendering().detail == "NVIDIA A100 (a GPU)"
+
+
+@pytest.mark.rendering
+def test_what_draws_is_named() -> None:
+    found = describe_renderer()
+    detail = doctor.check_rendering().detail
+    assert all(each in detail for each in (found.backend, found.renderer, found.vendor, found.version, "frames/s"))
+    assert ("software" in detail) == found.software
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the Debian remedy")
@@ -80,7 +91,7 @@ def test_rendering_that_fails_names_the_debian_packages(monkeypatch: pytest.Monk
     monkeypatch.setenv("MUJOCO_GL", "no-such-backend")
     check = doctor.check_rendering()
     assert not check.ok and "MUJOCO_GL=no-such-backend" in check.detail
-    assert doctor.REMEDY in check.remedy
+    assert doctor.REMEDY in check.remedy and doctor.ALTERNATIVE in check.remedy
 
 
 def test_a_compiler_that_only_pretends_is_found_out(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

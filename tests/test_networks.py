@@ -6,15 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from safeswitch_baselines.learners.networks import (
-    BayesianMLP,
-    InputEncoding,
-    MaskLayout,
-    MLPConfig,
-    bounded_log_var,
-    bounded_variance,
-    gaussian_nll,
-)
+from safeswitch_baselines.learners.gaussian import bounded_log_var, bounded_variance, gaussian_nll
+from safeswitch_baselines.learners.networks import BayesianMLP, InputEncoding, MLPConfig
 
 
 def samples(n: int = 12) -> list[torch.Tensor]:
@@ -86,7 +79,7 @@ def test_masks_drop_and_scale_units():
 
 def test_dropout_rates_are_met_in_every_layer():
     config = MLPConfig(hidden=(64, 32, 16), dropout=(0.1, 0.0, 0.4))
-    layout = MaskLayout.of(config)
+    layout = config.layout
     first, second, third = layout.draw(np.random.PCG64DXSM(0), 4000)
     assert second is None and first is not None and third is not None
     assert first.shape == (4000, 64) and third.shape == (4000, 16)

@@ -10,15 +10,20 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from micro import MICRO, TASK, leaderboard_bytes, micro_run
 from safeswitch import pipeline, stages
+from safeswitch.handover.episode import NeverSwitch, run_episode
 from safeswitch.pipeline import Run
 from safeswitch.stages import CellTables, Job
-from safeswitch.store import Store
+from safeswitch.store import Key, Store
+from safeswitch.suite import Task
+from safeswitch.trained import Trained, fitted_signals, signals_of
 
 PASSIVE = {
     "safeswitch",  # registers the ids
@@ -29,31 +34,38 @@ PASSIVE = {
     "safeswitch.tasks",  # chooses the rendering backend
     "safeswitch.tasks.checks",  # errors alone
     "safeswitch.tasks.rendering",  # pictures alone: an image task names it in its `modules`
+    "safeswitch.tasks.visual",  # as rendering: disturbances of what a camera sees
 }
 """Modules that a stage may use without depending on their content: no number of a result comes from them."""
 
 
-def jobs_of(store: Store) -> dict[str, Job]:
+NOVEL = replace(TASK, signals=(*TASK.signals, "mahalanobis", "mahalanobis-mean3", "ensemble"))
+"""The task with signals that are fitted, and that need the learners of other seeds."""
+
+
+def jobs_of(store: Store, task: Task = TASK, members: tuple[Key, ...] = ()) -> dict[str, Job]:
     """One job of each stage, with its key; nothing is run."""
-    cell = TASK.paper_cell
-    demonstrations = stages.demonstrations_job(store, TASK, MICRO)
-    learner = stages.learner_job(store, TASK, MICRO, 0, demonstrations)
+    cell = task.paper_cell
+    demonstrations = stages.demonstrations_job(store, task, MICRO)
+    learner = stages.learner_job(store, task, MICRO, 0, demonstrations)
+    fits = stages.fits_job(store, task, 0, learner, demonstrations) if fitted_signals(task) else None
+    trained = Trained(str(store.root), 0, learner.key, fits and fits.key, members)
     keys = {
-        (each, split): tuple(job.key for job in stages.table_jobs(store, TASK, each, split, 2, learner))
-        for each in (cell, TASK.none_cell)
+        (each, split): tuple(job.key for job in stages.table_jobs(store, task, each, split, 2, trained))
+        for each in (cell, task.none_cell)
         for split in ("calibrate", "test")
     }
     tables = CellTables(
-        keys[cell, "calibrate"], keys[TASK.none_cell, "calibrate"], keys[cell, "test"], keys[TASK.none_cell, "test"]
+        keys[cell, "calibrate"], keys[task.none_cell, "calibrate"], keys[cell, "test"], keys[task.none_cell, "test"]
     )
-    table = stages.table_jobs(store, TASK, cell, "test", 2, learner)[0]
-    episodes = stages.episodes_job(store, TASK, cell, 0, learner, tables, give_back=False)
-    signals = stages.signals_job(store, TASK, cell, 0, tables)
-    scores = pipeline.publish.scores_job(store, TASK, None, [episodes], [signals])  # type: ignore[arg-type]
-    spread = pipeline.publish.spread_job(store, TASK, 0, tables)
-    figures = pipeline.publish.figures_job(store, TASK, learner, episodes, tables, scores)
-    every = (demonstrations, learner, table, episodes, signals, scores, spread, figures)
-    return {job.stage: job for job in every}
+    table = stages.table_jobs(store, task, cell, "test", 2, trained)[0]
+    episodes = stages.episodes_job(store, task, cell, trained, tables, give_back=False)
+    signals = stages.signals_job(store, task, cell, 0, tables)
+    scores = pipeline.publish.scores_job(store, task, None, [episodes], [signals])  # type: ignore[arg-type]
+    spread = pipeline.publish.spread_job(store, task, 0, tables)
+    figures = pipeline.publish.figures_job(store, task, trained, episodes, tables, scores)
+    every = (demonstrations, learner, fits, table, episodes, signals, scores, spread, figures)
+    return {job.stage: job for job in every if job is not None}
 
 
 def edited(module: str) -> type[Store]:
@@ -76,7 +88,7 @@ def edited(module: str) -> type[Store]:
         ("safeswitch.scoring.figures", {"figures"}),
         ("safeswitch.scoring.signal_quality", {"signals", "scores", "figures"}),
         ("safeswitch.handover.episode", {"table", "episodes", "signals", "scores", "spread", "figures"}),
-        ("safeswitch_baselines.signals", {"table", "episodes", "signals", "scores", "spread", "figures"}),
+        ("safeswitch_baselines.signals/smoothing.py", {"table", "episodes", "signals", "scores", "spread", "figures"}),
         (
             "safeswitch_baselines.learners/networks.py",
             {"learner", "table", "episodes", "signals", "scores", "spread", "figures"},
@@ -106,11 +118,43 @@ def test_keys_depend_on_settings_and_not_on_the_folder(tmp_path: Path) -> None:
     assert len(learners) == 3
 
 
+def test_what_is_fitted_depends_on_learner_and_demonstrations_and_tables_depend_on_it(tmp_path: Path) -> None:
+    assert "signal-fits" not in jobs_of(Store(tmp_path)), "the state cart-pole fits nothing"
+    jobs = jobs_of(Store(tmp_path), NOVEL)
+    assert jobs["signal-fits"].key.recipe["inputs"] == [jobs["learner"].key, jobs["demonstrations"].key]
+    assert jobs["signal-fits"].key.recipe["settings"]["signals"] == ["mahalanobis"], "once for its smoothed versions"
+    assert jobs["table"].key.recipe["inputs"] == [jobs["learner"].key, jobs["signal-fits"].key]
+    after = jobs_of(edited("safeswitch_baselines.signals/fitting.py")(tmp_path), NOVEL)
+    assert {stage for stage in jobs if jobs[stage].key == after[stage].key} == {"demonstrations", "learner"}
+
+
+def test_tables_of_an_ensemble_depend_on_every_learner(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    learners = [stages.learner_job(store, NOVEL, MICRO, seed, jobs_of(store)["demonstrations"]) for seed in range(3)]
+    one = jobs_of(store, NOVEL, (learners[1].key,))["table"]
+    both = jobs_of(store, NOVEL, (learners[1].key, learners[2].key))["table"]
+    assert one.key != both.key and both.key.recipe["inputs"][2:] == [learners[1].key, learners[2].key]
+
+
+def test_signals_that_need_other_learners_are_left_out_where_there_is_one(tmp_path: Path) -> None:
+    assert signals_of(NOVEL, 2) == NOVEL.signals
+    assert signals_of(NOVEL, 1) == (*TASK.signals, "mahalanobis", "mahalanobis-mean3")
+    assert Run(NOVEL, MICRO, Store(tmp_path)).task.signals == signals_of(NOVEL, 1)
+    assert Run(TASK, MICRO, Store(tmp_path)).task == TASK
+
+
 def imports_of(module: str) -> Iterator[str]:
-    """Modules of the suite that the source of `module` imports, type checking aside."""
+    """Modules of the suite that `module`, or any module of a package, imports, type checking aside."""
     spec = importlib.util.find_spec(module)
     assert spec is not None and spec.origin is not None
-    tree = ast.parse(Path(spec.origin).read_text())
+    origin = Path(spec.origin)
+    for file in sorted(origin.parent.glob("*.py")) if origin.name == "__init__.py" else [origin]:
+        yield from imports_in(file)
+
+
+def imports_in(file: Path) -> Iterator[str]:
+    """Modules of the suite that one source file imports."""
+    tree = ast.parse(file.read_text())
     hidden = {
         each
         for node in ast.walk(tree)
@@ -175,6 +219,23 @@ def test_one_worker_and_two_write_the_same_bytes(finished: tuple[Path, bytes], t
     assert one.keys() == two.store.keys()
     for key in one.keys():
         assert files_of(one, key) == files_of(two.store, key), key
+
+
+@pytest.mark.slow
+def test_fitted_signals_and_ensembles_are_recorded_and_driven_alike(tmp_path: Path) -> None:
+    run = Run(NOVEL, replace(MICRO, learners=2), Store(tmp_path), workers=2)
+    cell = run.task.paper_cell
+    for trained in run.trained:
+        assert len(trained.keys) == 3, "the learner, its fits, the other learner"
+        table = run.tables_of(trained.seed, cell).load(run.store, run.task, cell)["test"]
+        assert set(table.signals) == set(NOVEL.signals)
+        env = stages.make_env(run.task, cell)
+        learner, signals = trained.learner(run.task), trained.signals(run.task)
+        for row, seed in enumerate(table.seeds):  # in this process, one after the other
+            episode = run_episode(env, learner, signals, NeverSwitch(), None, int(seed))
+            for name, trace in episode.signals.items():
+                np.testing.assert_array_equal(trace, table.signals[name][row], err_msg=name)
+            assert np.nanmin(episode.signals["ensemble"]) > 0 and np.nanmin(episode.signals["mahalanobis"]) > 0
 
 
 def files_of(store: Store, key: str) -> dict[str, bytes]:

@@ -20,10 +20,18 @@ def trace(signal: Signal, values: list[float]) -> list[float]:
     return [signal.update(OBSERVATION, prediction([0.0], [value**2]), None) for value in values]
 
 
-@pytest.mark.parametrize("name", SIGNALS)
+@pytest.mark.parametrize("name", ["epistemic", "aleatoric", "total"])
 def test_signals_satisfy_the_protocol_and_bear_their_id(name):
     signal = make_signal(name)
     assert isinstance(signal, Signal) and signal.id == name
+
+
+def test_every_signal_of_the_baselines_is_registered_under_its_id():
+    assert set(registry.names("signal")) == {*SIGNALS, "smoothed"}
+    for name, factory in SIGNALS.items():
+        assert registry.find("signal", name) is factory and registry.base_signal(f"{name}-mean3") == name
+    with pytest.raises(ValueError, match="unknown signal 'totl'; valid, nearest first: total"):
+        registry.base_signal("totl-mean3")
 
 
 def test_base_signals_are_standard_deviations_in_action_units():
@@ -89,7 +97,7 @@ def test_signals_of_others_are_smoothed_too():
     class Novelty(Total):
         id = "novelty"
 
-    assert make_signal("novelty-mean3", {"novelty": Novelty}).id == "novelty-mean3"
+    assert make_signal("novelty-mean3", factories={"novelty": Novelty}).id == "novelty-mean3"
 
 
 def test_registered_signals_of_other_packages_are_found(monkeypatch):

@@ -32,6 +32,43 @@ METADATA = "safeswitch_demonstrations"
 """Key of the settings, as JSON text, in the metadata of the dataset."""
 
 
+class EpisodeFrames:
+    """Images (n, H, W, C) uint8 of several episodes that stay in their file until an episode is asked for.
+
+    Args:
+        file: the `main_data.hdf5` of a Minari dataset.
+        lengths: steps of every episode; the observation after the last step is left out.
+    """
+
+    ndim = 4
+    dtype = np.dtype(np.uint8)
+
+    def __init__(self, file: Path | str, lengths: Sequence[int]) -> None:
+        import h5py
+
+        self.file = Path(file)
+        self.lengths = tuple(int(length) for length in lengths)
+        with h5py.File(self.file, "r") as data:
+            self.shape = (sum(self.lengths), *data["episode_0"]["observations"].shape[1:])
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def episode(self, index: int) -> NDArray[np.uint8]:
+        """Images (L, H, W, C) of an episode."""
+        import h5py
+
+        # Opened for every call: an open file could be neither pickled nor shared with worker processes.
+        with h5py.File(self.file, "r") as data:
+            images: NDArray[np.uint8] = data[f"episode_{index}"]["observations"][: self.lengths[index]]
+        return images
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        """All images in memory, for those who ask NumPy for them."""
+        images = np.concatenate([self.episode(index) for index in range(len(self.lengths))])
+        return images if dtype is None else images.astype(dtype)
+
+
 def write(
     rollouts: Sequence[Rollout],
     env_id: str,
@@ -49,7 +86,7 @@ def write(
     root.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".demonstrations-", dir=root) as temporary:
         dataset = _create(rollouts, env_id, dataset_id, Path(temporary), noise, dict(env_kwargs or {}))
-        if _is_image(rollouts[0].observations):
+        if is_image(rollouts[0].observations):
             _compress(Path(temporary) / dataset_id / "data" / "main_data.hdf5")
         # After the compression, because the metadata states the size of the data.
         dataset.storage.update_metadata({"dataset_size": dataset.storage.get_size()})
@@ -117,7 +154,8 @@ def _describe(env_id: str, rollouts: Sequence[Rollout], noise: Noise) -> str:
     )
 
 
-def _is_image(observations: NDArray[Any]) -> bool:
+def is_image(observations: Any) -> bool:
+    """Whether observations (n, ...) are images: an array, or a dataset in a file."""
     return observations.dtype == np.uint8 and observations.ndim == 4
 
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from safeswitch.datasets import METADATA, make_task, write
+from safeswitch.datasets import METADATA, EpisodeFrames, is_image, make_task, write
 from safeswitch.names import unknown
 from safeswitch.seeding import stream
 
@@ -96,19 +96,30 @@ class Demonstrations:
     """What a learner is trained on: n steps of several episodes, in order.
 
     Attributes:
-        observations: (n, ...), as the environment gives them.
+        observations: (n, ...), as the environment gives them; images stay in their file until an episode is asked for.
         actions: (n, nu), clean expert labels in action units.
         episodes: (n,), index of the episode that a step belongs to.
         settings: how they were made (environment, seeds, noise).
     """
 
-    observations: NDArray[Any]
+    observations: NDArray[Any] | EpisodeFrames
     actions: NDArray[np.float64]
     episodes: NDArray[np.int64]
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.observations)
+
+    def steps(self, episode: int) -> slice:
+        """Where the steps of an episode are."""
+        start, stop = np.searchsorted(self.episodes, [episode, episode + 1])
+        return slice(int(start), int(stop))
+
+    def episode(self, episode: int) -> NDArray[Any]:
+        """Observations (L, ...) of an episode."""
+        if isinstance(self.observations, EpisodeFrames):
+            return self.observations.episode(episode)
+        return self.observations[self.steps(episode)]
 
 
 def collect(
@@ -226,23 +237,31 @@ def load(dataset_id: str, root: Path | str) -> Demonstrations:
     Raises:
         FileNotFoundError: there is no such dataset below `root`; the message names those that are there.
     """
+    import h5py
+
     folder = Path(root) / dataset_id / "data"
     if not (folder / "metadata.json").is_file():
         there = sorted(str(path.parent.parent.relative_to(root)) for path in Path(root).glob("**/data/metadata.json"))
         listing = ", ".join(there) if there else "there are none; `collect` makes one"
         raise FileNotFoundError(f"no Minari dataset {dataset_id!r} below {root}; datasets there: {listing}")
-    from minari import MinariDataset
-
-    dataset = MinariDataset(folder)
-    observations, labels, episodes = [], [], []
-    for index, episode in enumerate(dataset.iterate_episodes()):
-        if "expert_action" not in episode.infos:
-            raise ValueError(f"dataset {dataset_id!r} has no infos['expert_action']: it is no set of demonstrations")
-        length = len(episode.rewards)
-        observations.append(episode.observations[:length])
-        labels.append(episode.infos["expert_action"][:length])
-        episodes.append(np.full(length, index, dtype=np.int64))
-    settings = json.loads(str(dataset.storage.metadata.get(METADATA, "{}")))
+    file = folder / "main_data.hdf5"
+    settings = json.loads(json.loads((folder / "metadata.json").read_text(encoding="utf-8")).get(METADATA, "{}"))
+    observations, labels, lengths = [], [], []
+    with h5py.File(file, "r") as data:
+        for index in range(len(data)):
+            episode = data[f"episode_{index}"]
+            if "expert_action" not in episode.get("infos", {}):
+                raise ValueError(
+                    f"dataset {dataset_id!r} has no infos['expert_action']: it is no set of demonstrations"
+                )
+            lengths.append(len(episode["rewards"]))
+            labels.append(episode["infos"]["expert_action"][: lengths[-1]])
+            if not is_image(episode["observations"]):
+                observations.append(episode["observations"][: lengths[-1]])
+    images = EpisodeFrames(file, lengths) if not observations else None
     return Demonstrations(
-        np.concatenate(observations), np.concatenate(labels).astype(np.float64), np.concatenate(episodes), settings
+        images or np.concatenate(observations),
+        np.concatenate(labels).astype(np.float64),
+        np.repeat(np.arange(len(lengths)), lengths),
+        settings,
     )

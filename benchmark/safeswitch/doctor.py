@@ -25,7 +25,7 @@ from rich.table import Table
 from rich.text import Text
 
 from safeswitch.store import default_root
-from safeswitch.tasks.rendering import REMEDY
+from safeswitch.tasks.opengl import ALTERNATIVE, REMEDY, is_software
 
 PYTHONS = ((3, 11), (3, 13))
 """First supported version and first unsupported one."""
@@ -37,7 +37,6 @@ TIMEOUT = 120.0
 """A check that takes longer hangs [s]."""
 
 REINSTALL = "make setup (or: pip install -c constraints.txt -e .)"
-SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swrast", "swiftshader")
 
 
 @dataclass(frozen=True)
@@ -77,8 +76,8 @@ print(json.dumps({"detail": "compose, compile and step agree"}))
 """
 
 _RENDER = """
-import json, os, time
-from safeswitch.tasks.rendering import Renderer
+import json, time
+from safeswitch.tasks.rendering import Renderer, describe_renderer
 import mujoco
 model = mujoco.MjModel.from_xml_string(
     "<mujoco><worldbody><light pos='0 -3 3' dir='0 1 -1'/><geom type='box' size='.5 .5 .5' rgba='1 0 0 1'/>"
@@ -94,11 +93,10 @@ start, frames = time.perf_counter(), 200
 for _ in range(frames):
     renderer.render(model, data)
 rate = frames / (time.perf_counter() - start)
-from OpenGL import GL
-name = (GL.glGetString(GL.GL_RENDERER) or b"unnamed renderer").decode()
 renderer.close()
-backend = os.environ.get("MUJOCO_GL") or "system OpenGL"
-print(json.dumps({"detail": f"{backend}: {name}, {rate:.0f} frames/s at 64 x 64", "renderer": name}))
+found = describe_renderer()
+detail = f"{found.backend}: {found.renderer}, {found.vendor}, OpenGL {found.version}, {rate:.0f} frames/s at 64 x 64"
+print(json.dumps({"detail": detail, "renderer": found.renderer}))
 """
 
 _TORCH = """
@@ -190,15 +188,17 @@ def check_pair() -> Check:
 
 
 def check_rendering() -> Check:
-    """A frame is rendered off screen and has the right colours in the right places."""
+    """A frame is rendered off screen and has the right colours in the right places; says what has drawn it."""
     ok, detail, found = _probe(_RENDER)
-    if ok and any(each in found.get("renderer", "").lower() for each in SOFTWARE_RENDERERS):
-        detail += " (software, no GPU needed)"
     if ok:
-        return Check("rendering", True, detail)
+        drawn_by = "software, no GPU needed" if is_software(found.get("renderer", "")) else "a GPU"
+        return Check("rendering", True, f"{detail} ({drawn_by})")
     detail = f"MUJOCO_GL={os.environ.get('MUJOCO_GL', '')}: {detail}"
     if sys.platform == "linux":
-        remedy = f"on Debian, as root: {REMEDY}; and leave MUJOCO_GL unset, or set it to egl"
+        remedy = (
+            f"on Debian, as root: {REMEDY}; and leave MUJOCO_GL unset, or set it to egl. "
+            f"Without EGL: {ALTERNATIVE}, and MUJOCO_GL=osmesa"
+        )
     else:
         remedy = "unset MUJOCO_GL, and run in a session with a display"
     return Check("rendering", False, detail, remedy)

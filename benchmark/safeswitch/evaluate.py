@@ -56,9 +56,7 @@ def evaluate(run: Run, method_id: str, disturbance: str, severity: int, protocol
     return dict(table[table["method"] == method_id].iloc[0])
 
 
-def play(
-    run: Run, driver: str, disturbance: str, severity: int, protocol: str, seed: int, path: Path
-) -> Episode:
+def play(run: Run, driver: str, disturbance: str, severity: int, protocol: str, seed: int, path: Path) -> Episode:
     """Drive one episode and write its film.
 
     Args:
@@ -83,8 +81,7 @@ def play(
         if not hasattr(rule, "update"):
             raise ValueError(f"{driver} needs hindsight and cannot drive an episode")
     env = stages.make_env(run.task, cell, render_mode="rgb_array")
-    learner = stages.load_learner(run.task, str(run.store.folder(run.learners[0].key)))
-    signals = [registry.make_signal(name) for name in run.task.signals]
+    learner, signals = run.trained[0].learner(run.task), run.trained[0].signals(run.task)
     episode = run_episode(env, learner, signals, rule, env.make_expert(), seed, arming, record_snapshots=True)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_side_by_side([replay_frames(env, episode, driver)], path, round(1 / env.control_dt))

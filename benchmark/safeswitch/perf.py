@@ -34,6 +34,7 @@ from safeswitch.expert.codegen import FLAGS, find_compiler, source
 from safeswitch.expert.ddp import DDPSolver, Problem, Solution, make_solver
 from safeswitch.expert.graph import expanded
 from safeswitch.perf_handover import handover_benchmark
+from safeswitch.perf_rendering import rendering_benchmark
 from safeswitch.tasks.cart_pole import CartPoleConfig
 
 Array = NDArray[np.float64]
@@ -288,8 +289,10 @@ def action_functions(problem: Problem) -> list[ca.Function]:
 
 
 def main() -> None:
-    """Print both benchmarks."""
-    for title, results in (("expert", expert_benchmark()), ("handover table", handover_benchmark())):
+    """Print every benchmark."""
+    benchmarks = {"expert": expert_benchmark, "rendering": rendering_benchmark, "handover table": handover_benchmark}
+    for title, benchmark in benchmarks.items():
+        results = benchmark()
         print(f"--- {title}")
         for name, value in results.items():
             print(f"{name:28s} {value:.6g}" if isinstance(value, float) else f"{name:28s} {value}")

@@ -1,4 +1,4 @@
-"""READ FIRST: expert -> demonstrations -> learner -> handover tables -> switch rules -> leaderboard.
+"""READ FIRST: expert -> demonstrations -> learner -> signals -> handover tables -> switch rules -> leaderboard.
 
 A `Run` holds the stages of one task in this order; `stages.py` says what each computes, `suite.py` what is run, and
 `publish.py` writes the tables. Finished work is kept in a store by the hash of everything it depends on, so that a
@@ -22,6 +22,7 @@ from safeswitch.stages import (
     Job,
     demonstrations_job,
     episodes_job,
+    fits_job,
     learner_job,
     make_env,
     signals_job,
@@ -29,6 +30,7 @@ from safeswitch.stages import (
 )
 from safeswitch.store import Store
 from safeswitch.suite import Cell, Profile, Split, Task
+from safeswitch.trained import Trained, fitted_signals, needs_members, with_signals_of
 
 
 @dataclass
@@ -36,7 +38,7 @@ class Run:
     """One task under one profile: each property is a stage, computed when it is first asked for.
 
     Attributes:
-        task: the task.
+        task: the task; its signals are those that the profile's learners allow.
         profile: how much is run.
         store: where finished work is kept.
         workers: processes at a time; the results do not depend on it.
@@ -50,6 +52,10 @@ class Run:
     workers: int = 2
     seconds: dict[str, float] = field(default_factory=dict)
     work: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Leave out the signals that need more learners than the profile has."""
+        self.task = with_signals_of(self.task, self.profile.learners)
 
     @cached_property
     def demonstrations(self) -> Job:
@@ -68,6 +74,29 @@ class Run:
         ]
         self.finish("training", jobs)
         return jobs
+
+    @cached_property
+    def trained(self) -> list[Trained]:
+        """Each learner with what its signals need: fits to its training steps, and the learners of the other seeds."""
+        keys = [job.key for job in self.learners]
+        fits = [
+            fits_job(self.store, self.task, seed, learner, self.demonstrations)
+            for seed, learner in enumerate(self.learners)
+            if fitted_signals(self.task)
+        ]
+        if fits:
+            self.finish("signal fits", fits)
+        members = any(needs_members(signal) for signal in self.task.signals)
+        return [
+            Trained(
+                str(self.store.root),
+                seed,
+                key,
+                fits[seed].key if fits else None,
+                tuple(other for other in keys if other != key) if members else (),
+            )
+            for seed, key in enumerate(keys)
+        ]
 
     @cached_property
     def tables(self) -> dict[tuple[int, str], CellTables]:
@@ -89,8 +118,8 @@ class Run:
     def _tables(self, cells: tuple[Cell, ...]) -> dict[tuple[int, str], CellTables]:
         counts: dict[Split, int] = {"calibrate": self.profile.calibrate, "test": self.profile.test}
         chunks = {
-            (seed, cell, split): table_jobs(self.store, self.task, cell, split, count, learner)
-            for seed, learner in enumerate(self.learners)
+            (trained.seed, cell, split): table_jobs(self.store, self.task, cell, split, count, trained)
+            for trained in self.trained
             for cell in cells
             for split, count in counts.items()
         }
@@ -111,10 +140,10 @@ class Run:
     @cached_property
     def episodes(self) -> list[Job]:
         """Every method calibrated and tested in each (learner, cell)."""
-        tables, learners = self.tables, self.learners
+        tables = self.tables
         jobs = [
-            episodes_job(self.store, self.task, cell, seed, learner, tables[seed, str(cell)], self._gives_back(cell))
-            for seed, learner in enumerate(learners)
+            episodes_job(self.store, self.task, cell, trained, tables[trained.seed, str(cell)], self._gives_back(cell))
+            for trained in self.trained
             for cell in self.profile.cells_of(self.task)
         ]
         self.finish("switch rules", jobs)
@@ -157,7 +186,7 @@ class Run:
         cell = str(self.task.paper_cell)
         episodes = next(job for job in self.episodes if job.label == f"{cell} learner 0")
         tables = self.tables[0, cell]
-        job = publish.figures_job(self.store, self.task, self.learners[0], episodes, tables, self.scores)
+        job = publish.figures_job(self.store, self.task, self.trained[0], episodes, tables, self.scores)
         self.finish("figures", [job])
         return job
 
@@ -185,4 +214,3 @@ def run_job(root: str, job: Job) -> str:
     with Store(root).writing(job.key) as folder:
         job.run(folder, *job.arguments)
     return job.label
-

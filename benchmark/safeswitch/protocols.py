@@ -6,15 +6,17 @@ actions of a task, `nx` the size of its full state. Actions are in action units,
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
+    from safeswitch.demos import Demonstrations
     from safeswitch.handover.panel import Calibration
 
 Array = NDArray[np.float64]
@@ -61,8 +63,24 @@ class Learner(Protocol):
 
 
 @runtime_checkable
+class FeatureLearner(Learner, Protocol):
+    """A learner whose trunk features signals can be fitted to."""
+
+    def features(self, demonstrations: Demonstrations) -> NDArray[np.float32]:
+        """(n, d), what `Prediction.features` would be at each of the n training steps, in order."""
+
+
+@runtime_checkable
 class Signal(Protocol):
-    """A scalar per step that should rise when the learner should not drive."""
+    """A scalar per step that should rise when the learner should not drive.
+
+    What is registered as a signal is a factory, of one of three kinds:
+
+    * without arguments, for a signal that reads the prediction alone;
+    * fitted, with a class method `fit` (see `FittedSignal`): called with the arrays that `fit` made for this learner;
+    * with a true attribute `members`: called with the learners of the other seeds. Their memory and randomness are
+      their own: the signal resets them with the episode and lets them predict at every step.
+    """
 
     id: str
 
@@ -71,6 +89,65 @@ class Signal(Protocol):
 
     def update(self, observation: NDArray[Any], prediction: Prediction, previous_action: Array | None) -> float:
         """Value at this step. `previous_action` is the action executed at the step before, None at step 0."""
+
+
+@runtime_checkable
+class FittedSignal(Signal, Protocol):
+    """A signal with something to learn from the training steps of its learner, once, before any episode."""
+
+    @classmethod
+    def fit(cls, training: TrainingFeatures, seed: int) -> dict[str, NDArray[Any]]:
+        """Arrays by name, from which the signal is made: a function of the arguments to the last bit."""
+
+
+@dataclass(frozen=True)
+class TrainingFeatures:
+    """What signals are fitted to; the features are computed once for all of them.
+
+    Attributes:
+        learner: the trained learner.
+        demonstrations: what it was trained on, n steps.
+    """
+
+    learner: FeatureLearner
+    demonstrations: Demonstrations
+
+    @cached_property
+    def features(self) -> NDArray[np.float32]:
+        """(n, d), trunk features of every training step."""
+        if not isinstance(self.learner, FeatureLearner):
+            name = type(self.learner).__name__
+            raise TypeError(f"{name} has no features(demonstrations): no signal can be fitted to its trunk features")
+        features = self.learner.features(self.demonstrations)
+        if features.ndim != 2 or len(features) != len(self.demonstrations):
+            raise ValueError(f"features have shape {features.shape}, expected ({len(self.demonstrations)}, d)")
+        return features
+
+    @property
+    def episodes(self) -> NDArray[np.int64]:
+        """(n,), index of the episode that a step belongs to."""
+        return self.demonstrations.episodes
+
+    @property
+    def executed(self) -> Array:
+        """(n, nu), executed actions in action units; the labels where demonstrations do not keep them."""
+        return getattr(self.demonstrations, "executed", self.demonstrations.actions)
+
+
+@dataclass(frozen=True)
+class SignalContext:
+    """What the signals of one learner are made from.
+
+    Attributes:
+        fits: arrays that `FittedSignal.fit` made for this learner, by the id of the unsmoothed signal.
+        members: learners of the other seeds.
+        shared: unsmoothed signals made in this context so far, for their smoothed versions to read. Signals of one
+            context are therefore updated together, in one episode at a time.
+    """
+
+    fits: Mapping[str, Mapping[str, NDArray[Any]]] = field(default_factory=dict)
+    members: Sequence[Learner] = ()
+    shared: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
 
 
 @runtime_checkable

@@ -30,6 +30,7 @@ from safeswitch.suite import SPLIT_SIZE, SPLITS, TASKS, Cell, Task, methods
 if TYPE_CHECKING:
     from safeswitch.pipeline import Run
     from safeswitch.stages import CellTables
+    from safeswitch.trained import Trained
 
 TABLES = ("leaderboard", "signals", "comparisons")
 LIBRARIES = ("casadi", "dm-control", "gymnasium", "minari", "mujoco", "numpy", "pandas", "scipy", "torch")
@@ -121,11 +122,11 @@ def _spread_row(cell: Cell, protocol: str, method: str, learner: int, seed: int,
     }
 
 
-def figures_job(store: Store, task: Task, learner: Job, episodes: Job, tables: CellTables, scores: Job) -> Job:
+def figures_job(store: Store, task: Task, trained: Trained, episodes: Job, tables: CellTables, scores: Job) -> Job:
     """Figures and video of the first learner in the paper's cell."""
-    keys = [learner.key, episodes.key, scores.key]
+    keys = [*trained.keys, episodes.key, scores.key]
     code = ["safeswitch.pictures", "safeswitch.scoring.figures", "safeswitch.scoring.video"]
-    arguments = (str(store.root), task, str(store.folder(learner.key)), episodes.key, tables, scores.key)
+    arguments = (str(store.root), task, trained, episodes.key, tables, scores.key)
     return Job("figures", task.name, store.key("figures", {"task": task.name}, keys, code), pictures.draw, arguments)
 
 
@@ -133,9 +134,9 @@ def _write_tables(run: Run, folder: Path) -> None:
     """Tables of the first three cells: signals and known outcomes, to score latched rules without MuJoCo."""
     folder.mkdir(parents=True, exist_ok=True)
     for job in run.episodes:
-        cell, learner = job.arguments[2], job.arguments[3]
+        cell, trained = job.arguments[2], job.arguments[3]
         if cell in run.task.cells[:3]:
-            target = folder / f"{cell.disturbance}-{cell.severity}-learner{learner}.npz"
+            target = folder / f"{cell.disturbance}-{cell.severity}-learner{trained.seed}.npz"
             shutil.copyfile(run.store.folder(job.key) / "test.npz", target)
 
 
@@ -205,4 +206,3 @@ def _version(distribution: str) -> str:
 
 def _sha(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
-

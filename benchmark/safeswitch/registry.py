@@ -9,12 +9,13 @@ The suite's own baselines register exactly as anybody's package does:
 from __future__ import annotations
 
 import importlib
+import re
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal
 
 from safeswitch.names import unknown
-from safeswitch.protocols import Method, Signal
+from safeswitch.protocols import Method, Signal, SignalContext
 
 Kind = Literal["learner", "signal", "method"]
 
@@ -23,6 +24,8 @@ GROUPS: dict[Kind, str] = {
     "signal": "safeswitch.signals",
     "method": "safeswitch.methods",
 }
+
+_SMOOTHING = re.compile(r"-[a-z]+[0-9]+$")
 
 
 @cache
@@ -52,9 +55,32 @@ def find(kind: Kind, name: str) -> Any:
     return _entries(kind)[name].load()
 
 
-def make_signal(signal_id: str) -> Signal:
-    """A fresh signal; `total-mean3` is `total` smoothed over three steps."""
-    return find("signal", "smoothed")(signal_id)
+def make_signal(signal_id: str, context: SignalContext | None = None) -> Signal:
+    """A fresh signal; `total-mean3` is `total` smoothed over three steps.
+
+    Args:
+        signal_id: any signal by its full id.
+        context: what signals that are fitted, or need the learners of the other seeds, are made from.
+    """
+    return find("signal", "smoothed")(signal_id, context)
+
+
+def base_signal(signal_id: str) -> str:
+    """Registered name of the signal that `signal_id` smooths, or is: `total` for `total-mean3`."""
+    name = signal_id if signal_id in _entries("signal") else _SMOOTHING.sub("", signal_id)
+    if name not in _entries("signal"):
+        raise unknown("signal", name, names("signal"))
+    return name
+
+
+def is_fitted(factory: Any) -> bool:
+    """Whether a signal's factory has to be fitted to training features (see `protocols.Signal`)."""
+    return hasattr(factory, "fit")
+
+
+def has_members(factory: Any) -> bool:
+    """Whether a signal's factory takes the learners of the other seeds."""
+    return bool(getattr(factory, "members", False))
 
 
 def make_method(method_id: str) -> Method:

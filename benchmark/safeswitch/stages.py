@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,11 +20,12 @@ from safeswitch.files import load_frame, save_arrays, save_frame
 from safeswitch.handover.episode import run_episode
 from safeswitch.handover.panel import Calibration, Panel
 from safeswitch.handover.table import HandoverTable, concatenate, join_chunks, record_table
-from safeswitch.protocols import ARMINGS, Arming
+from safeswitch.protocols import ARMINGS, Arming, TrainingFeatures
 from safeswitch.scoring.rows import episode_rows, latched_rows
 from safeswitch.scoring.signal_quality import signal_quality
 from safeswitch.store import Key, Store
 from safeswitch.suite import Cell, Profile, Split, Task, episode_seeds, methods
+from safeswitch.trained import Trained, base_signals, fitted_signals, load_learner
 
 if TYPE_CHECKING:
     from safeswitch.protocols import Method
@@ -106,13 +106,38 @@ def _train(folder: Path, task: Task, options: dict[str, Any], seed: int, dataset
     learner.save(folder / "learner")
 
 
-def table_jobs(store: Store, task: Task, cell: Cell, split: Split, count: int, learner: Job) -> list[Job]:
+def fits_job(store: Store, task: Task, seed: int, learner: Job, demonstrations: Job) -> Job:
+    """The task's fitted signals, fitted to the features that one learner has of its training steps."""
+    names = fitted_signals(task)
+    code = {source_of("learner", task.learner), *(source_of("signal", name) for name in names)}
+    key = store.key(
+        "signal-fits",
+        {"signals": list(names), "seed": seed},
+        [learner.key, demonstrations.key],
+        ["safeswitch.protocols", "safeswitch.seeding", *sorted(code)],
+    )
+    folders = (str(store.folder(learner.key)), str(store.folder(demonstrations.key)))
+    return Job("signal-fits", learner.label, key, _fit_signals, (task, names, seed, *folders))
+
+
+def _fit_signals(folder: Path, task: Task, names: tuple[str, ...], seed: int, learner: str, dataset_root: str) -> None:
+    training = TrainingFeatures(load_learner(task, learner), demos.load(task.dataset, Path(dataset_root)))
+    for name in names:
+        save_arrays(folder / f"{name}.npz", **registry.find("signal", name).fit(training, seed))
+
+
+def signal_code(task: Task) -> list[str]:
+    """Packages whose source the task's signals depend on."""
+    return sorted({source_of("signal", name) for name in ("smoothed", *base_signals(task.signals))})
+
+
+def table_jobs(store: Store, task: Task, cell: Cell, split: Split, count: int, trained: Trained) -> list[Job]:
     """The handover table of one (cell, learner) on the first `count` seeds of a split, in chunks of episodes.
 
     Outcomes are computed here for the cells whose tables are used again and again (`Cell.complete`); elsewhere they
     are computed when a rule first asks for them.
     """
-    code = [*PHYSICS, *task.code(), *HANDOVER, source_of("learner", task.learner), "safeswitch_baselines.signals"]
+    code = [*PHYSICS, *task.code(), *HANDOVER, source_of("learner", task.learner), *signal_code(task)]
     jobs = []
     for first in range(0, count, CHUNK):
         size = min(CHUNK, count - first)
@@ -124,28 +149,21 @@ def table_jobs(store: Store, task: Task, cell: Cell, split: Split, count: int, l
             "signals": list(task.signals),
             "complete": cell.complete,
         }
-        key = store.key("table", settings, [learner.key], code)
-        label = f"{cell} {split} {first}-{first + size - 1} ({learner.label})"
-        arguments = (task, cell, split, first, size, str(store.folder(learner.key)))
+        key = store.key("table", settings, trained.keys, code)
+        label = f"{cell} {split} {first}-{first + size - 1} (learner {trained.seed})"
+        arguments = (task, cell, split, first, size, trained)
         jobs.append(Job("table", label, key, _tabulate, arguments))
     return jobs
 
 
-def _tabulate(folder: Path, task: Task, cell: Cell, split: Split, first: int, count: int, learner: str) -> None:
+def _tabulate(folder: Path, task: Task, cell: Cell, split: Split, first: int, count: int, trained: Trained) -> None:
     env = make_env(task, cell)
-    signals = [registry.make_signal(name) for name in task.signals]
     seeds = episode_seeds(split, count, first)
-    table = record_table(env, load_learner(task, learner), signals, env.make_expert(), seeds)
+    table = record_table(env, trained.learner(task), trained.signals(task), env.make_expert(), seeds)
     if cell.complete:
         table.complete()
     table.save(folder / "table.npz")
     env.close()
-
-
-@cache
-def load_learner(task: Task, folder: str) -> Any:
-    """The trained learner, loaded once per process."""
-    return registry.find("learner", task.learner).load(Path(folder) / "learner")
 
 
 def load_table(store: Store, task: Task, cell: Cell, keys: tuple[str, ...]) -> HandoverTable:
@@ -164,7 +182,6 @@ class CellTables:
     test: tuple[str, ...]
     test_nominal: tuple[str, ...]
 
-
     def load(self, store: Store, task: Task, cell: Cell) -> dict[str, HandoverTable]:
         """Each table by the name of its attribute; tables of the same episodes are one object."""
         on = task.calibrated_on(cell)
@@ -177,18 +194,16 @@ class CellTables:
         return {name: by_keys[getattr(self, name)] for name in cells}
 
 
-def episodes_job(
-    store: Store, task: Task, cell: Cell, learner_seed: int, learner: Job, tables: CellTables, give_back: bool
-) -> Job:
+def episodes_job(store: Store, task: Task, cell: Cell, trained: Trained, tables: CellTables, give_back: bool) -> Job:
     """Calibrate every method and score it on the test episodes of one (learner, cell), under both armings."""
     ids = methods(task.signals)
-    settings = {"cell": str(cell), "learner_seed": learner_seed, "methods": list(ids), "give_back": give_back}
+    settings = {"cell": str(cell), "learner_seed": trained.seed, "methods": list(ids), "give_back": give_back}
     keys = [*tables.calibrate, *tables.calibrate_nominal, *tables.test, *tables.test_nominal]
     rules = {source_of("method", name.partition("@")[0]) for name in ids}
     code = ["safeswitch.handover.panel", "safeswitch.scoring.rows", *sorted(rules)]
-    key = store.key("episodes", settings, [learner.key, *keys], code)
-    arguments = (str(store.root), task, cell, learner_seed, str(store.folder(learner.key)), tables, give_back)
-    return Job("episodes", f"{cell} learner {learner_seed}", key, _score_episodes, arguments)
+    key = store.key("episodes", settings, [*trained.keys, *keys], code)
+    arguments = (str(store.root), task, cell, trained, tables, give_back)
+    return Job("episodes", f"{cell} learner {trained.seed}", key, _score_episodes, arguments)
 
 
 def _score_episodes(
@@ -196,8 +211,7 @@ def _score_episodes(
     root: str,
     task: Task,
     cell: Cell,
-    learner_seed: int,
-    learner: str,
+    trained: Trained,
     tables: CellTables,
     give_back: bool,
 ) -> None:
@@ -205,7 +219,7 @@ def _score_episodes(
     frames, logs = [], {}
     for protocol in protocols_of(cell):
         test = test_panel(loaded, cell, protocol)
-        calibration = calibration_of(loaded, task, cell, protocol, learner_seed)
+        calibration = calibration_of(loaded, task, cell, protocol, trained.seed)
         for method_id in methods(task.signals):
             method: Method = registry.make_method(method_id)
             if not method.latched and not give_back:
@@ -214,9 +228,9 @@ def _score_episodes(
             if method.latched:
                 rows = latched_rows(test, calibrated)
             else:
-                rows = _plain_rows(task, cell, learner, test, calibrated.rule)
+                rows = _plain_rows(task, cell, trained, test, calibrated.rule)
             on = "" if task.calibrated_on(cell) == cell else str(task.calibrated_on(cell))
-            frames.append(labelled(rows, cell, protocol, method_id, learner_seed, calibrated, on))
+            frames.append(labelled(rows, cell, protocol, method_id, trained.seed, calibrated, on))
             logs.update({f"{protocol}|{method_id}|{name}": value for name, value in calibrated.log.items()})
     save_frame(folder / "episodes.npz", concat(frames))
     save_arrays(folder / "logs.npz", **logs)
@@ -248,12 +262,11 @@ def _panel(table: HandoverTable, nominal: HandoverTable, cell: Cell, protocol: A
     return Panel(concatenate([table, nominal]) if protocol == "start" else table, protocol)
 
 
-def _plain_rows(task: Task, cell: Cell, learner: str, test: Panel, rule: Any) -> pd.DataFrame:
+def _plain_rows(task: Task, cell: Cell, trained: Trained, test: Panel, rule: Any) -> pd.DataFrame:
     """Rules that give control back have no table: drive the same episodes."""
-    signals = [registry.make_signal(name) for name in task.signals]
+    driver, signals = trained.learner(task), trained.signals(task)
     envs = {True: make_env(task, cell), False: make_env(task, task.none_cell)}
     experts = {kind: env.make_expert() for kind, env in envs.items()}
-    driver = load_learner(task, learner)
     episodes = [
         run_episode(envs[bool(kind)], driver, signals, rule, experts[bool(kind)], int(seed), test.arming)
         for seed, kind in zip(test.table.seeds, test.table.disturbed, strict=True)

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from safeswitch.names import unknown
 
 Split = Literal["train", "design", "calibrate", "pilot", "test"]
-Tag = Literal["paper", "none", "benign", "other"]
+Tag = Literal["paper", "none", "benign", "held-out", "other"]
 
 SPLITS: tuple[Split, ...] = ("train", "design", "calibrate", "pilot", "test")
 """`pilot` is retired: it was the test split of a first trial of the whole benchmark, after which the length of the
@@ -31,7 +31,10 @@ def episode_seeds(split: Split, count: int, first: int = 0) -> list[int]:
 
 @dataclass(frozen=True)
 class Cell:
-    """One (task, disturbance, severity). Severity is 0 for `none`."""
+    """One (task, disturbance, severity). Severity is 0 for `none`.
+
+    A `held-out` cell is the paper's disturbance with kinds of it that no calibration shows.
+    """
 
     task: str
     disturbance: str
@@ -67,6 +70,8 @@ class Task:
         cells: every cell, the paper's severity 3 first, then `none`, then a benign one.
         modules: modules of this task alone, which its results depend on.
         assets: folders under `assets`, which its results depend on.
+        showcase: signals that the figures show besides the paper's.
+        literal: the learner as the paper describes it, where it is not the one above; it is reported beside it.
     """
 
     name: str
@@ -79,6 +84,8 @@ class Task:
     assets: tuple[str, ...]
     learner_options: Mapping[str, Any] = field(default_factory=dict, hash=False)
     demonstrations: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    showcase: tuple[str, ...] = ()
+    literal: str = ""
 
     @property
     def paper_cell(self) -> Cell:
@@ -97,8 +104,10 @@ class Task:
         return [*self.modules, *(assets_folder() / name for name in self.assets)]
 
     def calibrated_on(self, cell: Cell) -> Cell:
-        """Thresholds of `none` and benign cells, in which nothing has to be saved, come from the paper's cell."""
-        return self.paper_cell if cell.tag in ("none", "benign") else cell
+        """Thresholds of held-out cells, and of `none` and benign ones, in which nothing has to be saved, come from the
+        paper's cell.
+        """
+        return self.paper_cell if cell.tag in ("none", "benign", "held-out") else cell
 
 
 def _cart_pole_cells() -> tuple[Cell, ...]:
@@ -108,6 +117,19 @@ def _cart_pole_cells() -> tuple[Cell, ...]:
         Cell(name, "none", 0, "none"),
         Cell(name, "repaint", 3, "benign"),
         *(Cell(name, "cart-mass", severity, "paper") for severity in (1, 2, 4, 5)),
+        *(Cell(name, other, 3, "other") for other in others),
+    )
+
+
+def _cart_pole_image_cells() -> tuple[Cell, ...]:
+    name = "cart-pole-image"
+    others = ("object-passing", "occlusion", "lighting", "camera-shift", "pixel-noise", "background", "cart-mass")
+    return (
+        Cell(name, "object", 3, "paper"),
+        Cell(name, "none", 0, "none"),
+        Cell(name, "object-far", 3, "benign"),
+        *(Cell(name, "object", severity, "paper") for severity in (1, 2, 4, 5)),
+        Cell(name, "object-held-out", 3, "held-out"),
         *(Cell(name, other, 3, "other") for other in others),
     )
 
@@ -127,6 +149,39 @@ TASKS: dict[str, Task] = {
         cells=_cart_pole_cells(),
         modules=("safeswitch.tasks.cart_pole", "safeswitch.expert.cart_pole_model"),
         assets=("cart_pole", "common"),
+    ),
+    "cart-pole-image": Task(
+        name="cart-pole-image",
+        env_id="SafeSwitch/CartPoleImage-v0",
+        learner="dropout-vgg",
+        learner_options={},
+        demonstrations={
+            "episodes": 400,
+            "noise": {"low": 0.23, "high": 0.23, "correlated_fraction": 1.0, "correlation": 0.5},
+        },
+        dataset="safeswitch/cart-pole-image/expert-v0",
+        signals=(
+            "epistemic",
+            "aleatoric",
+            "total",
+            "total-mean3",
+            "epistemic-mean3",
+            "ensemble",
+            "ensemble-mean3",
+            "mahalanobis",
+            "rnd",
+        ),
+        cells=_cart_pole_image_cells(),
+        modules=(
+            "safeswitch.tasks.cart_pole",
+            "safeswitch.tasks.cart_pole_image",
+            "safeswitch.tasks.rendering",
+            "safeswitch.tasks.visual",
+            "safeswitch.expert.cart_pole_model",
+        ),
+        assets=("cart_pole", "common"),
+        showcase=("ensemble",),
+        literal="paper-literal",
     ),
 }
 

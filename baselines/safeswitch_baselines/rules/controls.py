@@ -133,9 +133,7 @@ class Shuffled(SignalMethod):
     def calibrate(self, calibration: Calibration) -> Calibrated:
         """CEM with the traces shuffled, so that the control is as well calibrated as the rule."""
         panel = shuffled(calibration.panel, self.signal)
-        learned = CEM(self.signal).calibrate(
-            Calibration(panel, calibration.nominal, calibration.phi, calibration.seed)
-        )
+        learned = CEM(self.signal).calibrate(Calibration(panel, calibration.nominal, calibration.phi, calibration.seed))
         rule = _Shuffled(self.signal, learned.threshold)
         return replace(learned, rule=rule)
 

@@ -1,68 +1,42 @@
-"""Figures of the suite as small PNG files: the same data give the same bytes, and colours suit the colour-blind.
-
-No pyplot and no global state: every figure is drawn by its own Agg canvas, in matplotlib's default style, so a user's
-configuration changes nothing. Success and failure also differ in marker, not in colour alone.
-"""
+"""Figures about methods and signals: CEM's learning, success against autonomy, thresholds, signal quality."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib.style
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
 from safeswitch.names import unknown
 from safeswitch.protocols import Array
 from safeswitch.scoring.markdown import standing
 from safeswitch.scoring.metrics import PHI, REFERENCES, signal_of
+from safeswitch.scoring.style import (
+    BESIDE,
+    BLACK,
+    BLUE,
+    DASHES,
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    SKY,
+    VERMILLION,
+    YELLOW,
+    log_axis,
+    positive,
+    sheet,
+    stacked,
+)
 
-# Okabe & Ito's palette, https://jfly.uni-koeln.de/color/
-BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, VERMILLION, PURPLE = (
-    "#000000", "#E69F00", "#56B4E9", "#009E73", "#F0E442", "#0072B2", "#D55E00", "#CC79A7",
-)  # fmt: skip
-CYCLE = (BLUE, ORANGE, GREEN, PURPLE, SKY, VERMILLION, "#666666")
-DASHES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)))
-GREY = "#999999"
 NAMED_RULES = 4
-DPI = 110
-STYLE = {
-    "font.size": 9, "axes.titlesize": 10, "legend.fontsize": 8, "legend.framealpha": 0.9, "axes.grid": True,
-    "grid.alpha": 0.25, "grid.linewidth": 0.6, "axes.spines.top": False, "axes.spines.right": False,
-    "lines.linewidth": 1.4,
-}  # fmt: skip
-
-
-@contextmanager
-def _figure(path: Path, width: float, height: float, rows: tuple[float, ...] = (1.0,)) -> Iterator[tuple[Figure, Any]]:
-    """A figure [inch] with panels of these relative heights below one another, written to `path` on leaving."""
-    with matplotlib.style.context(["default", STYLE]):
-        figure = Figure(figsize=(width, height), dpi=DPI, layout="constrained")
-        FigureCanvasAgg(figure)
-        axes = figure.subplots(len(rows), 1, sharex=True, squeeze=False, height_ratios=rows)[:, 0]
-        yield figure, axes
-        path.parent.mkdir(parents=True, exist_ok=True)
-        # Without the version of matplotlib in it, the file depends on the pixels alone.
-        figure.savefig(path, metadata={"Software": None}, pil_kwargs={"optimize": True})
-
-
-def _log_axis(axes: Axes, which: str) -> None:
-    """Make an axis ("x" or "y") logarithmic, with plain numbers: 0.1, 0.2, 0.5; the latter two on short ranges."""
-    getattr(axes, f"set_{which}scale")("log")
-    axis = getattr(axes, f"{which}axis")
-    low, high = getattr(axes, f"get_{which}lim")()
-    axis.set_minor_locator(LogLocator(subs=(2, 5)))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    short = high / low < 2000
-    axis.set_minor_formatter(FuncFormatter(lambda value, _: f"{value:g}") if short else NullFormatter())
+COLUMNS = 4
+"""Small multiples beside one another."""
 
 
 def outcome_margins(samples: ArrayLike, success: ArrayLike) -> tuple[float, float]:
@@ -102,7 +76,8 @@ def figure_cem(
     iteration = np.arange(1.0, len(samples) + 1)
     accepted = np.asarray(log.get("accepted", np.ones(len(samples))), bool)
     lower, upper = outcome_margins(samples, success) if margins is None else margins
-    with _figure(path, 7.0, 7.2, rows=(2.4, 1.5, 1.0)) as (figure, (top, middle, bottom)):
+    with sheet(path, 7.0, 7.2) as figure:
+        top, middle, bottom = stacked(figure, (2.4, 1.5, 1.0))
         figure.suptitle(title or "Cross-Entropy Method: learning a threshold", fontsize=11)
         _sampled_thresholds(top, iteration, samples, success, (lower, upper), threshold)
         _belief(middle, iteration, np.asarray(log["mu"], float), np.asarray(log["sigma"], float), threshold)
@@ -110,7 +85,7 @@ def figure_cem(
         if not accepted.all():
             rejected = np.asarray(log["reward_sum"], float)[~accepted]
             bottom.plot(iteration[~accepted], rejected, "x", color=VERMILLION, ms=8, mew=2, label="repeated")
-            bottom.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+            bottom.legend(**BESIDE)
         bottom.set(xlabel="iteration", ylabel="sum of rewards")
         bottom.set_xlim(0.4, len(samples) + 0.6)
         bottom.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -130,7 +105,7 @@ def _sampled_thresholds(
     values = np.concatenate([samples[np.isfinite(samples) & (samples > 0)], [threshold]])
     limits = (values.min() / 1.25, values.max() * 1.25)
     axes.set_ylim(*limits)
-    _log_axis(axes, "y")
+    log_axis(axes, "y")
     if margins[0] > limits[0]:
         axes.axhspan(limits[0], margins[0], color=BLUE, alpha=0.12, lw=0, label="below the lower margin")
     if margins[1] < limits[1]:
@@ -140,82 +115,16 @@ def _sampled_thresholds(
             axes.plot(x[mask], samples[mask], marker, color=colour, markersize=4, alpha=0.75, ls="none", label=label)
     axes.axhline(threshold, color=BLACK, lw=1.6, label=f"learned threshold {threshold:.3g}")
     axes.set(ylabel="sampled threshold [signal units]")
-    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    axes.legend(**BESIDE)
 
 
 def _belief(axes: Axes, iteration: Array, mu: Array, sigma: Array, threshold: float) -> None:
     axes.fill_between(iteration, np.exp(mu - sigma), np.exp(mu + sigma), color=SKY, alpha=0.35, lw=0)
     axes.plot(iteration, np.exp(mu), "o-", color=BLUE, markersize=3.5, label=r"$e^{\mu}$, band $e^{\mu \pm \sigma}$")
     axes.axhline(threshold, color=BLACK, lw=1.0, ls="--")
-    _log_axis(axes, "y")
+    log_axis(axes, "y")
     axes.set(ylabel="CEM's belief")
-    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
-
-
-def figure_episode(
-    signals: Mapping[str, ArrayLike],
-    control_dt: float,
-    onset: int | None,
-    handover: int | None,
-    t_first: float | None,
-    threshold: float,
-    signal_id: str,
-    path: Path,
-    title: str = "",
-) -> Path:
-    """One episode's signals over time with t0, the handover, `t*_first` and the threshold.
-
-    Args:
-        signals: id -> (T,) in action units, NaN after an early end.
-        control_dt: control step [s].
-        onset: step t0; None or negative when undisturbed.
-        handover: first step of the expert; None or >= T when there is none.
-        t_first: `t*_first` [steps]; None, NaN or >= T when blank.
-        threshold: of the rule on `signal_id`.
-        signal_id: the rule's own signal, drawn bold.
-        path: PNG to write.
-        title: above the figure.
-    """
-    if signal_id not in signals:
-        raise unknown("signal", signal_id, signals)
-    horizon = len(np.asarray(signals[signal_id]))
-    time = np.arange(horizon) * control_dt
-    switch = handover if handover is not None and 0 <= handover < horizon else None
-    with _figure(path, 7.5, 3.4) as (figure, (axes,)):
-        others = [name for name in signals if name != signal_id]
-        for i, name in enumerate(others):
-            colour = [c for c in CYCLE if c != BLUE][i % (len(CYCLE) - 1)]
-            axes.plot(time, signals[name], color=colour, ls=DASHES[1 + i % (len(DASHES) - 1)], lw=1.0, label=name)
-        axes.plot(time, signals[signal_id], color=BLUE, lw=2.0, label=signal_id)
-        axes.axhline(threshold, color=BLACK, lw=1.0, ls=":", label=f"threshold {threshold:.3g}")
-        axes.set_xlim(0, horizon * control_dt)
-        _log_axis(axes, "y")
-        if switch is not None:
-            axes.axvspan(switch * control_dt, horizon * control_dt, color=GREEN, alpha=0.12, lw=0)
-        events = [
-            (onset, r"$t_0$", BLACK, "-"),
-            (switch, "handover", GREEN, "-"),
-            (t_first, r"$t^*_\mathrm{first}$", VERMILLION, "--"),
-        ]
-        _mark_events(axes, events, control_dt, horizon)
-        axes.set(xlabel="time [s]", ylabel="signal [action units]")
-        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
-        figure.suptitle(
-            title or ("learner, then expert (shaded)" if switch is not None else "learner alone"), fontsize=10
-        )
-    return path
-
-
-def _mark_events(axes: Axes, events: list[tuple[Any, str, str, str]], control_dt: float, horizon: int) -> None:
-    """Vertical lines, named above the frame; names of events close together go one above the other."""
-    shown = [e for e in events if e[0] is not None and np.isfinite(e[0]) and 0 <= e[0] < horizon]
-    taken: list[float] = []
-    for step, label, colour, line in sorted(shown, key=lambda event: event[0]):
-        level = sum(abs(step - other) < 0.1 * horizon for other in taken)
-        taken.append(step)
-        axes.axvline(step * control_dt, color=colour, ls=line, lw=1.3)
-        position = (step * control_dt, 1.01 + 0.06 * level)
-        axes.annotate(label, position, xycoords=axes.get_xaxis_transform(), color=colour, ha="center", va="bottom")
+    axes.legend(**BESIDE)
 
 
 def figure_plane(
@@ -240,7 +149,8 @@ def figure_plane(
         raise ValueError(f"the leaderboard has no rows for {task}, {cell[0]} severity {cell[1]}, protocol {protocol!r}")
     rows = rows.assign(kind=[standing(name, privileged) for name in rows["method"]])
     rows = rows.sort_values(["return_mean", "method"], ascending=[False, True], kind="stable")
-    with _figure(path, 8.0, 5.0) as (_, (axes,)):
+    with sheet(path, 8.0, 5.0) as figure:
+        axes = figure.subplots()
         if protocol == "start":  # there return = autonomy + phi * success, but for steps driven before a failure
             _iso_returns(axes, rows)
         named = _worth_naming(rows)
@@ -249,7 +159,7 @@ def figure_plane(
         _named_points(axes, rows[named])
         axes.set(xlabel="autonomy (share of steps driven by the learner)", ylabel="success")
         axes.set_title(f"{task}, {cell[0]} severity {cell[1]}, protocol {protocol}", loc="left")
-        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, title="method, return")
+        axes.legend(**BESIDE, title="method, return")
     return path
 
 
@@ -294,49 +204,121 @@ def _worth_naming(rows: pd.DataFrame) -> NDArray[np.bool_]:
     return (named | (place == 0) | ((rows["kind"] == "rule") & (place < NAMED_RULES))).to_numpy()
 
 
+RULE_MARKERS = "osD^vPX*"
+
+
 def figure_threshold_sweep(
-    thresholds: ArrayLike | Mapping[str, ArrayLike],
+    thresholds: Mapping[str, ArrayLike],
     returns: Mapping[str, ArrayLike],
     marks: Mapping[str, float],
     path: Path,
     levels: Mapping[str, float] | None = None,
     title: str = "",
+    strong: Sequence[str] = (),
 ) -> Path:
-    """Mean return of a constant threshold, for every threshold and signal, and where each method put its own.
+    """Mean return of a constant threshold, one panel a signal, and where each method put its own threshold.
 
     Args:
-        thresholds: (n,) in the signal's units, increasing, or one such array per signal.
-        returns: signal -> (n,) mean return.
-        marks: method id (`rule@signal`) -> its threshold; marked on the curve of its signal, as a line without one.
+        thresholds: signal -> (n,) in the signal's units, increasing.
+        returns: signal -> (n,) mean return; for the same signals.
+        marks: method id (`rule@signal`) -> its threshold; marked on the curve of its signal.
         path: PNG to write.
         levels: name -> return of methods without a threshold (learner, expert, ...).
         title: above the figure.
+        strong: signals that come first and in colour; the others in grey.
     """
-    grids = {name: _grid(thresholds, name) for name in returns}
-    with _figure(path, 8.0, 4.4) as (_, (axes,)):
-        for i, (name, values) in enumerate(returns.items()):
-            axes.plot(grids[name], values, color=CYCLE[i % len(CYCLE)], ls=DASHES[i % len(DASHES)], label=name)
-        for i, (name, level) in enumerate((levels or {}).items()):
-            axes.axhline(level, color=GREY, lw=0.9, ls=DASHES[i % len(DASHES)], label=f"{name} {level:.2f}")
-        shapes: Callable[[int], str] = lambda i: "osD^vPX*"[i % 8]  # noqa: E731
-        for i, (method, threshold) in enumerate(marks.items()):
-            signal = signal_of(method) or ""
-            if signal in returns:
-                colour = CYCLE[list(returns).index(signal) % len(CYCLE)]
-                height = np.interp(np.log(threshold), np.log(grids[signal]), np.asarray(returns[signal], float))
-                axes.plot(threshold, height, shapes(i), color=colour, mec=BLACK, markersize=7, ls="none", label=method)
-            else:
-                axes.axvline(threshold, color=BLACK, lw=0.9, ls=DASHES[i % len(DASHES)], label=method)
-        _log_axis(axes, "x")
-        axes.set(xlabel="threshold [signal units]", ylabel="mean return")
-        axes.set_title(title, loc="left")
-        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    for signal in [*strong, *returns, *(signal_of(method) for method in marks)]:
+        if signal not in returns or signal not in thresholds:
+            raise unknown("signal", str(signal), returns if signal not in returns else thresholds)
+    names = list(dict.fromkeys([*strong, *returns]))
+    rules = list(dict.fromkeys(method.partition("@")[0] for method in marks))
+    columns = min(COLUMNS, len(names))
+    count = -(-len(names) // columns)
+    with sheet(path, 2.3 * columns + 1.4, 1.9 * count + 0.7) as figure:
+        every = figure.subplots(count, columns, sharey=True, squeeze=False)
+        for axes, name in zip(every.flat, names, strict=False):
+            _sweep_panel(axes, np.asarray(thresholds[name], float), np.asarray(returns[name], float), levels or {})
+            axes.lines[0].set_color(BLUE if name in strong else GREY)
+            axes.set_title(name, loc="left", fontweight="bold" if name in strong else "normal")
+            for method, threshold in marks.items():
+                if signal_of(method) == name:
+                    place = rules.index(method.partition("@")[0])
+                    _mark_threshold(axes, threshold, RULE_MARKERS[place % len(RULE_MARKERS)])
+        for axes in every.flat[len(names) :]:
+            axes.set_axis_off()
+        for place, rule in enumerate(rules):  # for the legend alone
+            every[0, 0].plot([], [], RULE_MARKERS[place % len(RULE_MARKERS)], color=ORANGE, mec=BLACK, label=rule)
+        figure.legend(*every[0, 0].get_legend_handles_labels(), loc="outside right upper", frameon=False)
+        figure.supxlabel("threshold [signal units]", fontsize=9)
+        figure.supylabel("mean return", fontsize=9)
+        figure.suptitle(title, fontsize=10)
     return path
 
 
-def _grid(thresholds: ArrayLike | Mapping[str, ArrayLike], signal: str) -> Array:
-    if not isinstance(thresholds, Mapping):
-        return np.asarray(thresholds, float)
-    if signal not in thresholds:
-        raise unknown("signal", signal, thresholds)
-    return np.asarray(thresholds[signal], float)
+def _sweep_panel(axes: Axes, grid: Array, values: Array, levels: Mapping[str, float]) -> None:
+    axes.plot(grid, values)
+    for i, (name, level) in enumerate(levels.items()):
+        axes.axhline(level, color=BLACK, lw=0.8, ls=DASHES[1 + i % (len(DASHES) - 1)], label=f"{name} {level:.2f}")
+    axes.set_xlim(grid[0], grid[-1])
+    if positive(grid):
+        log_axis(axes, "x")
+
+
+def _mark_threshold(axes: Axes, threshold: float, marker: str) -> None:
+    """On the curve that the axes already hold; at the edge where the threshold lies beyond it."""
+    grid, values = (np.asarray(each, float) for each in axes.lines[0].get_data())
+    x = float(np.clip(threshold, grid[0], grid[-1]))
+    axes.plot(x, np.interp(x, grid, values), marker, color=ORANGE, mec=BLACK, ms=6.5, ls="none", clip_on=False)
+
+
+def figure_signals(
+    table: pd.DataFrame,
+    task: str,
+    disturbances: Mapping[str, str],
+    path: Path,
+    severity: int = 3,
+    strong: Collection[str] = (),
+) -> Path:
+    """How well every signal tells disturbed from undisturbed frames, one panel a disturbance.
+
+    Args:
+        table: what `signal_table` returns.
+        task: for example "cart-pole".
+        disturbances: name -> title of its panel, in order; those without rows are left out.
+        path: PNG to write.
+        severity: of the disturbances.
+        strong: signals in colour; the others in grey.
+    """
+    rows = table[(table["task"] == task) & (table["severity"] == severity)]
+    shown = [name for name in disturbances if (rows["disturbance"] == name).any()]
+    if not shown:
+        raise ValueError(f"the signal table has no rows for {task}, severity {severity}, {list(disturbances)}")
+    first = rows[rows["disturbance"] == shown[0]].sort_values(["frame_auroc", "signal"], kind="stable")
+    order = first["signal"].tolist()  # by the first disturbance, best on top
+    columns = min(COLUMNS, len(shown))
+    count = -(-len(shown) // columns)
+    with sheet(path, 1.9 * columns + 1.6, (0.19 * len(order) + 0.45) * count + 0.7) as figure:
+        every = figure.subplots(count, columns, sharex=True, sharey=True, squeeze=False)
+        for axes, name in zip(every.flat, shown, strict=False):
+            _signal_dots(axes, rows[rows["disturbance"] == name], order, strong)
+            axes.set_title(disturbances[name], loc="left", fontsize=9)
+        for axes in every.flat[len(shown) :]:
+            axes.set_axis_off()
+        note = "frame AUROC: median and range over learners (dashed: chance; diamonds: signals of the other figures)"
+        figure.supxlabel(note, fontsize=9)
+        figure.suptitle(f"{task}, severity {severity}: disturbed against undisturbed frames", fontsize=10)
+    return path
+
+
+def _signal_dots(axes: Axes, rows: pd.DataFrame, order: Sequence[str], strong: Collection[str]) -> None:
+    """Median and range of each signal, at its place in `order`, lowest first."""
+    axes.axvline(0.5, color=BLACK, lw=0.8, ls="--")
+    for place, signal in enumerate(order):
+        for _, row in rows[rows["signal"] == signal].iterrows():
+            colour, size = (BLUE, 5.5) if signal in strong else ("#666666", 4.0)
+            axes.hlines(place, row["frame_auroc_min"], row["frame_auroc_max"], color=colour, lw=1.6, alpha=0.6)
+            axes.plot(row["frame_auroc"], place, "D" if signal in strong else "o", color=colour, ms=size)
+    axes.set_yticks(range(len(order)), order)
+    axes.set_ylim(-0.7, len(order) - 0.3)
+    axes.set_xlim(-0.03, 1.03)
+    axes.set_xticks([0.0, 0.5, 1.0], ["0", "0.5", "1"])

@@ -13,13 +13,15 @@ from typing import TYPE_CHECKING, Any
 
 import mujoco
 
+from safeswitch.tasks.opengl import switched_off
+
 if TYPE_CHECKING:
     from safeswitch.tasks.cart_pole import CartPoleConfig
 
 RAIL_LEG_INSET = 0.2
 """Distance of the legs from the ends of the rail [m]; only for the eye."""
-ROD_RADIUS, BOB_RADIUS = 0.035, 0.09
-"""Of the pole as the image task draws it [m]: two and four and a half pixels wide."""
+ROD_RADIUS, BOB_RADIUS = 0.04, 0.1
+"""Of the pole as the image task draws it [m]: two and six pixels wide."""
 
 
 def assets_folder() -> Path:
@@ -45,7 +47,8 @@ def compose(base: str, model: str = "common/scene.xml") -> Any:
 
 def _part(path: str) -> Any:
     """MJCF tree of one file below `assets`."""
-    from dm_control import mjcf
+    with switched_off():  # dm_control composes and never draws: it need not start OpenGL
+        from dm_control import mjcf
 
     return mjcf.from_path(str(assets_folder() / path))
 

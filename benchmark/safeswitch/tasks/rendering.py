@@ -4,64 +4,68 @@ What was measured on Mesa's software rasteriser at 64 x 64: default settings abo
 reflection and skybox 1,270; without multisampling too 4,250; with coarse shapes too 7,850. `fast=True` sets all of
 these. Cost follows the size of the off-screen buffer, so that it is always the size of the picture.
 
-Importing this module imports neither `mujoco` nor an OpenGL library: `choose_backend` has to run before they do.
+OpenGL objects are freed in the context that they belong to (elsewhere they would be somebody else's), by the thread
+that made them, and never by the garbage collector, which may run in the middle of another renderer's frame.
 """
 
 from __future__ import annotations
 
+import atexit
 import ctypes
-import ctypes.util
 import os
-import sys
 import threading
 import weakref
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from safeswitch.tasks.opengl import REMEDY, choose_backend, describe_renderer, make_context, refuse_after_fork
+
 if TYPE_CHECKING:
     import mujoco
 
-Image = NDArray[np.uint8]
+__all__ = ["REMEDY", "Image", "Renderer", "choose_backend", "describe_renderer", "probe", "quality", "simplify"]
 
-REMEDY = "apt-get install -y libegl1 libgl1-mesa-dri libopengl0"
-"""The Debian command that installs what off-screen rendering needs."""
+Image = NDArray[np.uint8]
 
 MAX_GEOMS = 1000
 
-_gl_process: int | None = None
-"""Process that has used OpenGL first, here or in a parent."""
-
-_abandoned: list[Any] = []
-"""OpenGL objects that this process or thread cannot free; kept, because their destructors would try to."""
+COSTLY = ("mjRND_SHADOW", "mjRND_REFLECTION", "mjRND_SKYBOX", "mjRND_HAZE")
+"""What a fast picture does without."""
 
 
-def has_egl() -> bool:
-    """Whether EGL can be loaded, and OpenGL beside it as PyOpenGL looks for it (Linux only)."""
-    if not sys.platform.startswith("linux"):
-        return False
-    try:
-        ctypes.CDLL("libEGL.so.1")
-    except OSError:
-        return False
-    return any(ctypes.util.find_library(name) for name in ("OpenGL", "GL"))
+@dataclass(eq=False)
+class _Objects:
+    """OpenGL objects of one renderer.
 
-
-def choose_backend() -> str:
-    """Settle `MUJOCO_GL` before `mujoco` or `dm_control` reads it, and return it.
-
-    On Linux an unset variable becomes `egl`, which needs no display. Where it says `egl` (or nothing) and there is no
-    EGL library, importing mujoco or dm_control would fail: it becomes `disabled`, physics works, and the first picture
-    raises an error that says what to install. Other values are the user's choice; on other systems nothing is touched.
+    A context belongs to its thread, and after a fork to the parent: elsewhere, keeping it is the only safe choice.
     """
-    chosen = os.environ.get("MUJOCO_GL", "").strip().lower()
-    if sys.platform.startswith("linux") and chosen in ("", "egl"):
-        chosen = "egl" if has_egl() else "disabled"
-        os.environ["MUJOCO_GL"] = chosen
-    return chosen
+
+    gl: Any
+    context: Any
+    thread: int
+    process: int
+    left: bool = False
+
+    def leave(self) -> None:
+        """Say that the renderer is gone; harmless at any moment."""
+        self.left = True
+
+    @property
+    def mine(self) -> bool:
+        """Whether this thread may touch them."""
+        return self.thread == threading.get_ident() and self.process == os.getpid()
+
+
+_objects: list[_Objects] = []
+"""Of every renderer that has not been freed."""
+
+_busy = threading.local()
+"""`_busy.now` while a context of this thread is in use."""
 
 
 def probe(width: int = 32, height: int = 32) -> tuple[bool, str]:
@@ -114,44 +118,78 @@ class Renderer:
         self._option = mujoco.MjvOption()
         self._camera = _camera(model, camera)
         self._rect = mujoco.MjrRect(0, 0, self.width, self.height)
-        self._gl = _gl_context(self.width, self.height)
-        self._gl.make_current()
-        with _quality(model, self.width, self.height, fast):
-            self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         if fast:
-            for flag in ("mjRND_SHADOW", "mjRND_REFLECTION", "mjRND_SKYBOX", "mjRND_HAZE"):
-                self._scene.flags[getattr(mujoco.mjtRndFlag, flag)] = 0
-        self._close = weakref.finalize(self, _free, self._gl, self._context, threading.get_ident(), os.getpid())
+            simplify(self._scene)
+        _sweep()
+        with _in_use():
+            self._gl = make_context(self.width, self.height)
+            self._gl.make_current()
+            with quality(model, self.width, self.height, fast):
+                self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+            mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+        self._close = weakref.finalize(self, _remember(self._gl, self._context).leave)
+        self._close.atexit = False  # `_at_exit` does it, before mujoco ends EGL
 
     def render(self, model: mujoco.MjModel, data: mujoco.MjData) -> Image:
         """Picture (height, width, 3) of `data`, whose kinematics must be up to date, in the looks of `model`."""
         if not self._close.alive:
             raise RuntimeError("this renderer is closed")
-        _refuse_after_fork()
+        refuse_after_fork()
         mj = self._mujoco
-        self._gl.make_current()
-        everything = mj.mjtCatBit.mjCAT_ALL.value
-        mj.mjv_updateScene(model, data, self._option, None, self._camera, everything, self._scene)
-        mj.mjr_render(self._rect, self._scene, self._context)
         picture = np.empty((self.height, self.width, 3), np.uint8)
-        mj.mjr_readPixels(picture, None, self._rect, self._context)
+        with _in_use():
+            self._gl.make_current()
+            everything = mj.mjtCatBit.mjCAT_ALL.value
+            mj.mjv_updateScene(model, data, self._option, None, self._camera, everything, self._scene)
+            mj.mjr_render(self._rect, self._scene, self._context)
+            mj.mjr_readPixels(picture, None, self._rect, self._context)
         return np.ascontiguousarray(picture[::-1])  # OpenGL's first row is the lowest one
 
     def close(self) -> None:
         """Free the OpenGL objects; harmless when called again."""
         self._close()
+        _sweep()
 
 
-def _free(gl: Any, context: Any, thread: int, process: int) -> None:
-    """Free the objects of one renderer in its own context: in another one they would be somebody else's."""
-    # A context belongs to its thread, and after a fork to the parent: there, leaking is the only safe choice.
-    if thread != threading.get_ident() or process != os.getpid():
-        _abandoned.append((gl, context))
+def _remember(gl: Any, context: Any) -> _Objects:
+    """Keep the objects of a new renderer until they are freed, at the latest when Python ends."""
+    # Again and again: what is registered last runs first, and mujoco and dm_control register EGL's end in between.
+    atexit.unregister(_at_exit)
+    atexit.register(_at_exit)
+    objects = _Objects(gl, context, threading.get_ident(), os.getpid())
+    _objects.append(objects)
+    return objects
+
+
+@contextmanager
+def _in_use() -> Iterator[None]:
+    """Nothing is freed meanwhile: that would leave the thread without a current context."""
+    _busy.now = True
+    try:
+        yield
+    finally:
+        _busy.now = False
+
+
+def _sweep(everything: bool = False) -> None:
+    """Free the objects of this thread whose renderers are gone, or of all its renderers; not within a frame."""
+    if getattr(_busy, "now", False):
         return
-    gl.make_current()
-    context.free()
-    gl.free()
+    with _in_use():
+        for each in [each for each in _objects if each.mine and (each.left or everything)]:
+            each.gl.make_current()
+            each.context.free()
+            each.gl.free()
+            _objects.remove(each)
+
+
+def _at_exit() -> None:
+    """Free what this thread can, and keep the destructors of the rest from trying."""
+    with suppress(Exception):  # EGL may have ended already
+        _sweep(everything=True)
+    for each in _objects:
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(each.gl))
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(each.context))
 
 
 def _camera(model: mujoco.MjModel, name: str) -> mujoco.MjvCamera:
@@ -169,41 +207,16 @@ def _camera(model: mujoco.MjModel, name: str) -> mujoco.MjvCamera:
     return camera
 
 
-def _gl_context(width: int, height: int) -> Any:
-    """An off-screen OpenGL context of the chosen backend."""
-    _refuse_after_fork()
-    backend = os.environ.get("MUJOCO_GL", "").strip().lower()
-    on_linux = sys.platform.startswith("linux")
-    if on_linux and backend in ("", "egl", "disabled") and not has_egl():
-        raise RuntimeError(
-            f"cannot render: EGL (libEGL.so.1) or OpenGL (libOpenGL.so.0) is missing. On Debian or Ubuntu run: {REMEDY}"
-        )
-    try:
-        if on_linux and backend in ("", "egl"):
-            # Explicitly, because mujoco may have been imported before the backend was chosen.
-            from mujoco.egl import GLContext
-        else:
-            from mujoco.gl_context import GLContext
-        return GLContext(width, height)
-    except Exception as error:
-        advice = f" On Debian or Ubuntu run: {REMEDY}" if on_linux else ""
-        raise RuntimeError(f"cannot render: OpenGL (MUJOCO_GL={backend or 'unset'}) fails: {error}.{advice}") from error
+def simplify(scene: mujoco.MjvScene) -> None:
+    """Switch off in a scene what a fast picture does without."""
+    import mujoco
 
-
-def _refuse_after_fork() -> None:
-    """Refuse OpenGL in a forked child of a process that has used it: without the driver's threads it would hang."""
-    global _gl_process
-    if _gl_process is None:
-        _gl_process = os.getpid()
-    if _gl_process != os.getpid():
-        raise RuntimeError(
-            "cannot render: this process was forked from one that had rendered already, in which OpenGL would hang. "
-            "Start workers with the method 'spawn', for example gym.make_vec(..., vector_kwargs={'context': 'spawn'})"
-        )
+    for flag in COSTLY:
+        scene.flags[getattr(mujoco.mjtRndFlag, flag)] = 0
 
 
 @contextmanager
-def _quality(model: mujoco.MjModel, width: int, height: int, fast: bool) -> Iterator[None]:
+def quality(model: mujoco.MjModel, width: int, height: int, fast: bool) -> Iterator[None]:
     """Set the picture quality that a rendering context reads from the model while it is made, and nowhere else."""
     wanted: list[tuple[Any, str, int]] = [
         (model.vis.global_, "offwidth", width),

@@ -52,16 +52,17 @@ class Object(Disturbance):
     name = "object"
     kind = "appearance"
     tasks = IMAGES
-    levels = (0.08, 0.13, 0.18, 0.24, 0.30)
-    sentence = "an object of 0.06 m to {:g} m in radius appears in the picture"
+    levels = (0.06, 0.09, 0.13, 0.18, 0.24)
+    sentence = "an object of up to {:g} m in radius appears in the picture"
     KINDS: ClassVar[dict[str, Sizes]] = KINDS
-    SMALLEST: ClassVar[float] = 0.06
+    SMALLEST: ClassVar[float] = 0.5
+    """Of the sizes that are drawn, as a share of the largest."""
 
     def reset(self, rng: np.random.Generator, horizon: int) -> None:
         """Draw the object."""
         kinds = list(self.KINDS)
         self._props = self.KINDS[kinds[int(rng.integers(len(kinds)))]]
-        self._size = rng.uniform(self.SMALLEST, self.value)
+        self._size = self.value * rng.uniform(self.SMALLEST, 1.0)
         self._colour = colorsys.hsv_to_rgb(rng.random(), rng.uniform(0.6, 1.0), rng.uniform(0.4, 1.0))
         self._turn = rng.uniform(-math.pi / 2, math.pi / 2)
         self._place = self._draw_place(rng, horizon)
@@ -96,7 +97,7 @@ class ObjectPassing(Object):
     """An object moves through the picture and leaves it: control could then be given back."""
 
     name = "object-passing"
-    sentence = "an object of 0.06 m to {:g} m in radius passes through the picture"
+    sentence = "an object of up to {:g} m in radius passes through the picture"
     START: ClassVar[float] = 1.6
     """Distance from the middle at which it enters, and leaves [m]: just out of view."""
     STEPS: ClassVar[tuple[int, int]] = (20, 30)
@@ -122,13 +123,12 @@ class ObjectFar(Object):
 
     name = "object-far"
     benign = True
-    levels = (0.06, 0.09, 0.12, 0.15, 0.18)
-    sentence = "an object of 0.04 m to {:g} m in radius appears in an upper corner"
-    SMALLEST = 0.04
+    levels = (0.04, 0.06, 0.08, 0.10, 0.12)
+    sentence = "an object of up to {:g} m in radius appears in an upper corner"
 
     def _draw_place(self, rng: np.random.Generator, horizon: int) -> NDArray[np.float64]:
         side = rng.choice((-1.0, 1.0))
-        return np.array([side * rng.uniform(1.0, 1.3), BEHIND, HINGE_HEIGHT + rng.uniform(1.05, 1.25)])
+        return np.array([side * rng.uniform(0.85, 1.05), BEHIND, HINGE_HEIGHT + rng.uniform(0.85, 1.05)])
 
 
 @offer

@@ -1,0 +1,222 @@
+"""The Bayesian learner for images: a `DropoutVGG` that remembers the last frames (Kendall & Gal, arXiv 1703.04977).
+
+One frame shows no velocity, so the network sees a stack of the last F frames, the oldest first. The stack is the
+learner's own memory: it starts with the episode, filled with the first frame. Apart from it, a prediction is a function
+of (episode seed, step) alone, as the masks of all learners are (`dropout.MaskStream`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from safeswitch.protocols import Prediction
+from safeswitch_baselines.learners import storage
+from safeswitch_baselines.learners.dropout import FrozenLayers, MaskStream, one_thread, scaled_masks
+from safeswitch_baselines.learners.gaussian import moments
+from safeswitch_baselines.learners.vgg import DropoutVGG, PixelEncoding, VGGConfig
+
+if TYPE_CHECKING:
+    from safeswitch.demos import Demonstrations
+    from safeswitch_baselines.learners.descent import Progress
+
+FORMAT = "safeswitch-dropout-vgg-1"
+
+
+class FrameStack:
+    """The last F frames, encoded when they arrive and not again.
+
+    Args:
+        encoding: of a frame.
+        frames: F.
+    """
+
+    def __init__(self, encoding: PixelEncoding, frames: int) -> None:
+        self._encoding = encoding
+        height, width, self._depth = encoding.observation_shape
+        self._stack = np.zeros((1, height, width, frames * self._depth), np.float32)
+        self._tensor = torch.from_numpy(self._stack).permute(0, 3, 1, 2)
+        self._frame = np.zeros(encoding.observation_shape, np.float32)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self._empty = True
+
+    def push(self, frame: NDArray[np.uint8]) -> torch.Tensor:
+        """Take the next frame (H, W, C) in; the stack (1, F C, H, W), valid until the next call."""
+        self._encoding(frame, self._frame)
+        depth = self._depth
+        if self._empty:
+            self._stack[0] = np.tile(self._frame, self._stack.shape[-1] // depth)
+            self._empty = False
+        else:
+            self._stack[..., :-depth] = self._stack[..., depth:]
+            self._stack[0, ..., -depth:] = self._frame
+        return self._tensor
+
+
+class DropoutVGGLearner:
+    """DropoutVGG as a `safeswitch.protocols.Learner`.
+
+    Args:
+        model: the trained network (it is moved to the CPU: one decision is too small for a GPU).
+        encoding: frame to network input.
+        config: what it was trained with; `config.samples` is K.
+        history: one number per epoch and curve, as `image_training` recorded it.
+    """
+
+    def __init__(
+        self,
+        model: DropoutVGG,
+        encoding: PixelEncoding,
+        config: VGGConfig,
+        history: Mapping[str, Sequence[float]] | None = None,
+    ) -> None:
+        self.model = model.cpu().eval()
+        self.encoding = encoding
+        self.config = config
+        self.history = {key: list(values) for key, values in (history or {}).items()}
+        self._prepare()
+
+    def _prepare(self) -> None:
+        """Build what `predict` needs from the model."""
+        config = self.config
+        height, width, _ = self.encoding.observation_shape
+        self._stack = FrameStack(self.encoding, config.frames)
+        self._head = FrozenLayers(self.model.linears(), config.head_rates, config.samples, config.shared_trunk)
+        self._masks = MaskStream(config.layout(height, width), config.samples)
+
+    @property
+    def observation_shape(self) -> tuple[int, ...]:
+        """Shape of the observations it was trained on."""
+        return self.encoding.observation_shape
+
+    def reset(self, seed: int) -> None:
+        """Start an episode: forget the frames and key the dropout masks by its seed."""
+        self._stack.reset()
+        self._masks.reset(seed)
+
+    def predict(self, observation: NDArray[Any], step: int) -> Prediction:
+        """Action and variances for one frame (H, W, C) uint8 at environment step `step`.
+
+        `features` are the flattened features (d,) of the trunk before dropout.
+        """
+        frame = self._checked(observation)
+        masks = self._masks.draw(step)
+        blocks = len(self.config.channels)
+        with one_thread(), torch.inference_mode():
+            stack = self._stack.push(frame)
+            features = self.model.trunk(stack).numpy()
+            if self.config.shared_trunk:
+                self._head.inputs[...] = features
+            else:
+                factors = scaled_masks(masks[:blocks], self.config.trunk_rates)
+                copies = stack.expand(self.config.samples, -1, -1, -1).contiguous(memory_format=torch.channels_last)
+                self._head.inputs[...] = self.model.trunk(copies, factors).numpy()
+            output = self._head(masks[blocks:])
+        action, epistemic_var, aleatoric_var = moments(output, self.model.actions, self.config.log_var_bounds)
+        return Prediction(np.minimum(np.maximum(action, -1.0), 1.0), epistemic_var, aleatoric_var, features[0].copy())
+
+    def _checked(self, observation: NDArray[Any]) -> NDArray[np.uint8]:
+        frame = np.asarray(observation)
+        if frame.shape != self.encoding.observation_shape or frame.dtype != np.uint8:
+            raise ValueError(
+                f"observation has shape {frame.shape} and type {frame.dtype}, but this learner was trained on images "
+                f"of shape {self.encoding.observation_shape} and type uint8"
+            )
+        return frame
+
+    def features(self, demonstrations: Demonstrations) -> NDArray[np.float32]:
+        """Trunk features (n, d) of every training step, in order.
+
+        They are computed in batches; those of `predict` may differ in the last bits.
+        """
+        from safeswitch_baselines.learners.image_training import trunk_features
+
+        return trunk_features(self.model, self.encoding, demonstrations)
+
+    @classmethod
+    def train(
+        cls, demos: Demonstrations, seed: int, options: Mapping[str, Any] | None = None, progress: Progress = False
+    ) -> DropoutVGGLearner:
+        """Train on demonstrations; `options` are fields of `VGGConfig`. See `image_training.train_dropout_vgg`."""
+        from safeswitch_baselines.learners.image_training import train_dropout_vgg
+
+        config = cls.configure(options or {})
+        model, encoding, history = train_dropout_vgg(demos, seed, config, progress)
+        return cls(model, encoding, config, history)
+
+    @classmethod
+    def configure(cls, options: Mapping[str, Any]) -> VGGConfig:
+        """The configuration that `options` ask for."""
+        return VGGConfig.from_json(options)
+
+    def save(self, folder: Path | str) -> Path:
+        """Write weights (safetensors), config and history (JSON) into `folder`, whole or not at all."""
+        tensors = {f"network.{key}": value for key, value in self.model.state_dict().items()}
+        tensors["encoding.scale"] = torch.from_numpy(self.encoding.scale)
+        tensors["encoding.offset"] = torch.from_numpy(self.encoding.offset)
+        description = {
+            "observation_shape": self.encoding.observation_shape,
+            "actions": self.model.actions,
+            "config": self.config.to_json(),
+            "history": self.history,
+        }
+        return storage.write(folder, FORMAT, tensors, description)
+
+    @classmethod
+    def load(cls, folder: Path | str) -> DropoutVGGLearner:
+        """Learner saved by `save`; it predicts the same bits on the same machine."""
+        tensors, description = storage.read(folder, FORMAT)
+        config = VGGConfig.from_json(description["config"])
+        encoding = PixelEncoding(*(tensors.pop(f"encoding.{name}").numpy().copy() for name in ("scale", "offset")))
+        state = {key.removeprefix("network."): value for key, value in tensors.items()}
+        return cls(_network_of(state, encoding, config), encoding, config, description["history"])
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy in another process is rebuilt from; the frames seen so far stay behind."""
+        weights = {key: value.numpy() for key, value in self.model.state_dict().items()}
+        return {"weights": weights, "encoding": self.encoding, "config": self.config, "history": self.history}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Rebuild the network in this process's own aligned memory."""
+        self.encoding, self.config, self.history = state["encoding"], state["config"], state["history"]
+        weights = {key: torch.tensor(value) for key, value in state["weights"].items()}
+        self.model = _network_of(weights, self.encoding, self.config).eval()
+        self._prepare()
+
+
+class PaperLiteralLearner(DropoutVGGLearner):
+    """The paper's learner, taken literally: a single frame, plain NLL, centred images, dropout everywhere."""
+
+    @classmethod
+    def configure(cls, options: Mapping[str, Any]) -> VGGConfig:
+        """The paper's settings where `options` say nothing."""
+        return VGGConfig.from_json({**PAPER_LITERAL, **options})
+
+
+PAPER_LITERAL: Mapping[str, Any] = {
+    "frames": 1,
+    "loss": "nll",
+    "warmup_epochs": 0,
+    "standardisation": "centred",
+    "trunk_dropout": 0.1,
+    "feature_dropout": 0.1,
+    "hidden_dropout": 0.1,
+}
+"""What sets `PaperLiteralLearner` apart; everything else is as in `VGGConfig`."""
+
+
+def _network_of(state: Mapping[str, torch.Tensor], encoding: PixelEncoding, config: VGGConfig) -> DropoutVGG:
+    """Network with the given weights."""
+    # The generator only keeps the initial weights, replaced at once, from touching torch's global one.
+    generator = torch.Generator().manual_seed(0)
+    model = DropoutVGG(encoding.observation_shape, len(state["output.bias"]) // 2, config, generator)
+    model.load_state_dict(dict(state))
+    return model
