@@ -95,13 +95,12 @@ def test_trace_grows_with_time_and_shows_nothing_of_the_future(state: tuple[Any,
     assert 30 == episode.handover < episode.length
     last = trace.picture(episode.length - 1)
     past = 0
-    for step in (0, 10, 29, 30, episode.length - 2):
+    for step in (2, 10, 29, 31, episode.length - 2):
         picture = trace.picture(step)
         assert picture.shape == (HEIGHT, TRACE, 3) and picture.dtype == np.uint8
         changed = np.flatnonzero((picture != last).any(axis=(0, 2)))
-        # Left of the present a frame is the last one, apart from the handover, which has not happened before step 30.
         cursor = round(TRACE * (0.14 + 0.82 * step / episode.horizon))
-        if step >= 30:
+        if step >= 30:  # before, the handover is not shown yet
             assert changed.min() >= cursor - 2
         coloured = is_colour(picture, COLOURS[Driver.LEARNER]) | is_colour(picture, COLOURS[Driver.EXPERT])
         assert np.flatnonzero(coloured.any(axis=0)).max(initial=0) <= cursor + 2
@@ -166,14 +165,15 @@ def test_film_of_four_drivers_is_small_and_as_long_as_its_longest(
     env, episode = image
     frames = replay_frames(env, episode, "rule", trace_of(episode, env.control_dt))
     path, fps = tmp_path / f"film{suffix}", round(1 / env.control_dt)
-    write_side_by_side([frames, frames[:20], frames, frames[:40]], path, fps, columns=2)
+    frames = frames if suffix == ".mp4" else frames[:12]
+    write_side_by_side([frames, frames[:8], frames, frames[:10]], path, fps, columns=2)
     film = list(iter(imageio.get_reader(path)))
     still = fps if suffix == ".mp4" else 0  # a .gif keeps pictures that repeat as one
     assert len(film) == len(frames) + still
     assert film[0].shape[:2] == (2 * TILE, 2 * frames[0].shape[1])
-    assert path.stat().st_size < 1_000_000 or suffix == ".gif"
-    ended = np.asarray(film[30])[:TILE, frames[0].shape[1] :, :3].astype(int)  # keeps its last frame
-    assert np.abs(ended - frames[19]).mean() < 8
+    assert path.stat().st_size < 1_000_000
+    ended = np.asarray(film[11])[:TILE, frames[0].shape[1] :, :3].astype(int)  # keeps its last frame
+    assert np.abs(ended - frames[7]).mean() < 8
 
 
 @pytest.mark.rendering

@@ -193,9 +193,7 @@ class Play:
 
         if len(runs := self.common.runs()) != 1:
             raise ValueError("play needs one task: add --task, for example --task cart-pole")
-        episode = play(
-            runs[0], self.driver, self.disturbance, self.severity, self.protocol, self.seed, self.out
-        )
+        episode = play(runs[0], self.driver, self.disturbance, self.severity, self.protocol, self.seed, self.out)
         verdict = "success" if episode.success else "failure"
         handover = episode.handover if episode.handover < episode.horizon else "never"
         console.print(f"{self.out}: {verdict}, onset {episode.onset}, handover {handover}, {episode.length} steps")

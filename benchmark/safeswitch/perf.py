@@ -290,7 +290,11 @@ def action_functions(problem: Problem) -> list[ca.Function]:
 
 def main() -> None:
     """Print every benchmark."""
-    benchmarks = {"expert": expert_benchmark, "rendering": rendering_benchmark, "handover table": handover_benchmark}
+    benchmarks: dict[str, Callable[[], dict[str, Any]]] = {
+        "expert": expert_benchmark,
+        "rendering": rendering_benchmark,
+        "handover table": handover_benchmark,
+    }
     for title, benchmark in benchmarks.items():
         results = benchmark()
         print(f"--- {title}")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 from joblib import Parallel, delayed, parallel_config
@@ -31,6 +31,9 @@ from safeswitch.stages import (
 from safeswitch.store import Store
 from safeswitch.suite import Cell, Profile, Split, Task
 from safeswitch.trained import Trained, fitted_signals, needs_members, with_signals_of
+
+PAPER = ("epistemic", "aleatoric", "total")
+"""The signals of the paper."""
 
 
 @dataclass
@@ -151,16 +154,34 @@ class Run:
 
     @cached_property
     def signals(self) -> list[Job]:
-        """Signal quality in each disturbed (learner, cell)."""
-        tables = self.tables
-        jobs = [
-            signals_job(self.store, self.task, cell, seed, tables[seed, str(cell)])
-            for seed in range(len(self.learners))
+        """Signal quality in each disturbed (learner, cell), and at the profile's further severities."""
+        tables, further = self.tables, self._further_tables()
+        test = {
+            (trained.seed, cell): tables[trained.seed, str(cell)].test
+            for trained in self.trained
             for cell in self.profile.cells_of(self.task)
             if cell.tag != "none"
+        }
+        none = str(self.task.none_cell)
+        jobs = [
+            signals_job(self.store, self.task, cell, self.trained[seed], keys, tables[seed, none].test[: len(keys)])
+            for (seed, cell), keys in {**test, **further}.items()
         ]
         self.finish("signal quality", jobs)
         return jobs
+
+    def _further_tables(self) -> dict[tuple[int, Cell], tuple[str, ...]]:
+        """Tables of the cells in which only signals are scored, on the first test episodes."""
+        profile = self.profile
+        count = min(profile.signal_episodes, profile.test)
+        chunks = {
+            (trained.seed, cell): table_jobs(self.store, self.task, cell, "test", count, trained)
+            for trained in self.trained
+            for cell in self.task.severities(*profile.signal_severities)
+        }
+        if chunks:
+            self.finish("further severities", [job for jobs in chunks.values() for job in jobs])
+        return {name: tuple(job.key for job in jobs) for name, jobs in chunks.items()}
 
     @cached_property
     def scores(self) -> Job:
@@ -189,6 +210,17 @@ class Run:
         job = publish.figures_job(self.store, self.task, self.trained[0], episodes, tables, self.scores)
         self.finish("figures", [job])
         return job
+
+    @cached_property
+    def literal(self) -> Run | None:
+        """The same with the learner as the paper describes it, in two cells; None where the profile leaves it out."""
+        if not self.task.literal or not self.profile.literal_learners:
+            return None
+        task = replace(
+            self.task, learner=self.task.literal, learner_options=self.task.literal_options, signals=PAPER, literal=""
+        )
+        profile = replace(self.profile, learners=self.profile.literal_learners, cells=2, signal_severities=())
+        return Run(task, profile, self.store, self.workers)
 
     def _gives_back(self, cell: object) -> bool:
         return cell in self.task.cells[: self.profile.give_back_cells]

@@ -50,6 +50,10 @@ def publish(run: Run, folder: Path | None = None) -> Path:
     for name in TABLES:
         _merge(folder / f"{name}.csv", read_csv(run.store.folder(scores.key) / f"{name}.csv"))
     _merge(folder / "cem_seeds.csv", load_rows(run.store, spread, "cem_seeds.npz"))
+    if run.literal is not None:
+        for name in ("leaderboard", "signals"):
+            table = read_csv(run.store.folder(run.literal.scores.key) / f"{name}.csv")
+            _merge(folder / f"paper_literal_{name}.csv", table)
     _replace(run.store.folder(figures.key) / "figures", folder / "figures" / run.task.name)
     if run.profile.tables:
         _write_tables(run, folder / "tables" / run.task.name)

@@ -7,7 +7,7 @@ pure function of its arguments, so the bits do not depend on the number of worke
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,10 +17,11 @@ import pandas as pd
 
 from safeswitch import demos, registry
 from safeswitch.files import load_frame, save_arrays, save_frame
+from safeswitch.handover.clean import clean_traces
 from safeswitch.handover.episode import run_episode
 from safeswitch.handover.panel import Calibration, Panel
 from safeswitch.handover.table import HandoverTable, concatenate, join_chunks, record_table
-from safeswitch.protocols import ARMINGS, Arming, TrainingFeatures
+from safeswitch.protocols import ARMINGS, Arming, Array, TrainingFeatures
 from safeswitch.scoring.rows import episode_rows, latched_rows
 from safeswitch.scoring.signal_quality import signal_quality
 from safeswitch.store import Key, Store
@@ -299,32 +300,58 @@ def labelled(
     )
 
 
-def signals_job(store: Store, task: Task, cell: Cell, learner_seed: int, tables: CellTables) -> Job:
-    """Signal quality of one (learner, cell) against the undisturbed twins."""
-    settings = {"cell": str(cell), "learner_seed": learner_seed, "signals": list(task.signals)}
-    keys = [*tables.test, *tables.test_nominal]
-    key = store.key("signals", settings, keys, ["safeswitch.scoring.signal_quality", "safeswitch.handover.table"])
-    arguments = (str(store.root), task, cell, learner_seed, tables)
-    return Job("signals", f"{cell} learner {learner_seed}", key, _score_signals, arguments)
+def signals_job(
+    store: Store, task: Task, cell: Cell, trained: Trained, disturbed: tuple[str, ...], twins: tuple[str, ...]
+) -> Job:
+    """Signal quality of one (learner, cell), from the tables of test episodes and of their undisturbed twins."""
+    settings = {"cell": str(cell), "learner_seed": trained.seed, "signals": list(task.signals)}
+    code = ["safeswitch.scoring.signal_quality", "safeswitch.handover.table", "safeswitch.handover.clean"]
+    key = store.key("signals", settings, [*trained.keys, *disturbed, *twins], code)
+    arguments = (str(store.root), task, cell, trained, disturbed, twins)
+    return Job("signals", f"{cell} learner {trained.seed}", key, _score_signals, arguments)
 
 
-def _score_signals(folder: Path, root: str, task: Task, cell: Cell, learner_seed: int, tables: CellTables) -> None:
-    loaded = tables.load(Store(Path(root)), task, cell)
-    disturbed, twins = loaded["test"], loaded["test_nominal"]
+def _score_signals(
+    folder: Path,
+    root: str,
+    task: Task,
+    cell: Cell,
+    trained: Trained,
+    disturbed_keys: tuple[str, ...],
+    twin_keys: tuple[str, ...],
+) -> None:
+    store = Store(Path(root))
+    disturbed = load_table(store, task, cell, disturbed_keys)
+    twins: Mapping[str, Array]
+    if only_seen(cell):
+        env = make_env(task, cell)
+        twins, active = clean_traces(env, trained.learner(task), trained.signals(task), disturbed)
+        env.close()
+    else:
+        twins, active = load_table(store, task, task.none_cell, twin_keys).signals, None
     rows = []
     for signal in task.signals:
         quality = signal_quality(
             disturbed.signals[signal],
-            twins.signals[signal],
+            twins[signal],
             disturbed.onset,
             disturbed.t_first,
             disturbed.learner_success,
+            active,
         )
         rows.append({"signal": signal, **asdict(quality)})
     frame = pd.DataFrame(rows).assign(
-        task=cell.task, disturbance=cell.disturbance, severity=cell.severity, learner=learner_seed
+        task=cell.task, disturbance=cell.disturbance, severity=cell.severity, learner=trained.seed
     )
     save_frame(folder / "signals.npz", frame)
+
+
+def only_seen(cell: Cell) -> bool:
+    """Whether the disturbance changes nothing but the picture: the same state can then be seen without it."""
+    from safeswitch.tasks import visual  # noqa: F401  (registers the disturbances of images)
+    from safeswitch.tasks.disturbances import DISTURBANCES  # imports mujoco
+
+    return cell.tag != "none" and DISTURBANCES[cell.disturbance].only_seen
 
 
 def load_rows(store: Store, jobs: list[Job], name: str) -> pd.DataFrame:

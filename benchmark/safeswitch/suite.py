@@ -72,6 +72,7 @@ class Task:
         assets: folders under `assets`, which its results depend on.
         showcase: signals that the figures show besides the paper's.
         literal: the learner as the paper describes it, where it is not the one above; it is reported beside it.
+        literal_options: overrides of its configuration.
     """
 
     name: str
@@ -86,6 +87,7 @@ class Task:
     demonstrations: Mapping[str, Any] = field(default_factory=dict, hash=False)
     showcase: tuple[str, ...] = ()
     literal: str = ""
+    literal_options: Mapping[str, Any] = field(default_factory=dict, hash=False)
 
     @property
     def paper_cell(self) -> Cell:
@@ -96,6 +98,12 @@ class Task:
     def none_cell(self) -> Cell:
         """The undisturbed cell."""
         return next(cell for cell in self.cells if cell.tag == "none")
+
+    def severities(self, *severities: int) -> tuple[Cell, ...]:
+        """Cells of every disturbance at further severities, those that the task has already left out."""
+        disturbed = {cell.disturbance: cell.tag for cell in self.cells if cell.tag != "none"}
+        every = (Cell(self.name, name, severity, tag) for name, tag in disturbed.items() for severity in severities)
+        return tuple(cell for cell in every if cell not in self.cells)
 
     def code(self) -> list[str | Path]:
         """Modules and asset folders whose content the physics of this task depends on."""
@@ -224,6 +232,9 @@ class Profile:
         demonstrations: overrides of the task's demonstrations.
         learner_options: overrides of the learner's configuration.
         tables: whether the tables of the first three cells are committed with the results.
+        signal_severities: further severities of every disturbance at which the signals, and nothing else, are scored.
+        signal_episodes: test episodes of those.
+        literal_learners: number of learner seeds of the paper's learner taken literally.
     """
 
     name: str
@@ -235,6 +246,9 @@ class Profile:
     demonstrations: Mapping[str, Any] = field(default_factory=dict)
     learner_options: Mapping[str, Any] = field(default_factory=dict)
     tables: bool = False
+    signal_severities: tuple[int, ...] = ()
+    signal_episodes: int = 20
+    literal_learners: int = 0
 
     def cells_of(self, task: Task) -> tuple[Cell, ...]:
         """The cells of `task` in this profile."""
@@ -252,7 +266,17 @@ PROFILES: dict[str, Profile] = {
         learner_options={"hidden": (64, 64), "epochs": 20},
     ),
     "standard": Profile("standard", learners=1, cells=3, calibrate=100, test=100),
-    "full": Profile("full", learners=5, cells=None, calibrate=40, test=40, give_back_cells=3, tables=True),
+    "full": Profile(
+        "full",
+        learners=5,
+        cells=None,
+        calibrate=40,
+        test=40,
+        give_back_cells=3,
+        tables=True,
+        signal_severities=(1, 5),
+        literal_learners=2,
+    ),
 }
 
 

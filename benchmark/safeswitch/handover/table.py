@@ -225,9 +225,7 @@ def record_table(
     env: TaskEnv, learner: Learner, signals: Sequence[Signal], expert: Expert, seeds: Sequence[int]
 ) -> HandoverTable:
     """Run the learner alone on each seed; the outcomes are computed when they are asked for."""
-    episodes = [
-        run_episode(env, learner, signals, NeverSwitch(), None, seed, record_snapshots=True) for seed in seeds
-    ]
+    episodes = [run_episode(env, learner, signals, NeverSwitch(), None, seed, record_snapshots=True) for seed in seeds]
     snapshots = np.stack([episode.snapshots for episode in episodes if episode.snapshots is not None])
     table = new_table(
         np.array([episode.seed for episode in episodes], np.int64),

@@ -1,8 +1,8 @@
 """Cart-pole from images: the same cart-pole, seen through a third-person camera, one frame per step.
 
-The source paper's second task (Lee, Saigol, Theodorou, https://arxiv.org/abs/1803.10231): velocities are not in a frame,
-so that a learner has to remember some, and an object that training never showed appears in the picture. The object is
-only seen: it touches nothing, and the expert, which knows the full state, is not concerned.
+The source paper's second task (Lee, Saigol, Theodorou, https://arxiv.org/abs/1803.10231): velocities are not in a
+frame, so that a learner has to remember some, and an object that training never showed appears in the picture. The
+object is only seen: it touches nothing, and the expert, which knows the full state, is not concerned.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from safeswitch.tasks.rendering import Renderer
 SIZE = 64
 """Width and height of a frame [pixel]."""
 OVERSAMPLING = 2
-"""A pixel is the mean of this number squared of rendered ones: where an edge lies within a pixel can then be seen, and with it how fast the
-pole moves. Cheaper than multisampling by the driver."""
+"""A pixel is the mean of this number squared of rendered ones: where an edge lies within a pixel can then be seen, and
+with it how fast the pole moves. Cheaper than multisampling by the driver."""
 CAMERA = "third_person"
 RAIL = 1.0
 """Half the length of the rail [m]: all of it is in the picture, and a pixel is 3.4 cm."""

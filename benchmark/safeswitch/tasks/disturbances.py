@@ -40,6 +40,7 @@ class Disturbance:
         levels: the value of severity 1 .. 5, in the unit that `sentence` states; the effect grows with severity.
         sentence: description with one placeholder for the value.
         changes_inertia: whether constants that MuJoCo derives from masses must be recomputed after `alter`.
+        only_seen: whether it changes what is seen alone, so that the same state can be observed without it.
     """
 
     name: ClassVar[str]
@@ -49,6 +50,7 @@ class Disturbance:
     levels: ClassVar[tuple[float, float, float, float, float]]
     sentence: ClassVar[str]
     changes_inertia: ClassVar[bool] = False
+    only_seen: ClassVar[bool] = False
 
     def __init__(self, severity: int) -> None:
         self.severity = check_severity(severity)

@@ -15,7 +15,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safeswitch.tasks.disturbances import Disturbance, offer
+from safeswitch.tasks import disturbances
+from safeswitch.tasks.disturbances import offer
 
 IMAGES = frozenset({"cart-pole-image"})
 
@@ -25,6 +26,14 @@ BEHIND, IN_FRONT = 0.35, -0.45
 """Where objects stand, seen from the rail, away from the camera [m]."""
 
 Sizes = dict[str, tuple[float, float, float]]
+
+
+class Visual(disturbances.Disturbance):
+    """A disturbance of the picture."""
+
+    tasks = IMAGES
+    only_seen = True
+
 
 KINDS: dict[str, Sizes] = {
     "ball": {"prop_ball": (1.0, 1.0, 1.0)},
@@ -42,7 +51,7 @@ HELD_OUT: dict[str, Sizes] = {
 
 
 @offer
-class Object(Disturbance):
+class Object(Visual):
     """An object that no training image shows appears, and stays: the paper's disturbance.
 
     Kind, colour, size, turn and place are drawn; with the severity grow its size, and from severity 3 on it may stand
@@ -51,7 +60,6 @@ class Object(Disturbance):
 
     name = "object"
     kind = "appearance"
-    tasks = IMAGES
     levels = (0.06, 0.09, 0.13, 0.18, 0.24)
     sentence = "an object of up to {:g} m in radius appears in the picture"
     KINDS: ClassVar[dict[str, Sizes]] = KINDS
@@ -132,12 +140,11 @@ class ObjectFar(Object):
 
 
 @offer
-class Lighting(Disturbance):
+class Lighting(Visual):
     """The light is dimmed."""
 
     name = "lighting"
     kind = "appearance"
-    tasks = IMAGES
     levels = (0.85, 0.7, 0.55, 0.4, 0.25)
     sentence = "all light is multiplied by {:g}"
 
@@ -150,12 +157,11 @@ class Lighting(Disturbance):
 
 
 @offer
-class CameraShift(Disturbance):
+class CameraShift(Visual):
     """Somebody bumps into the camera: it stands elsewhere, in a random direction across the line of sight."""
 
     name = "camera-shift"
     kind = "sensing"
-    tasks = IMAGES
     levels = (0.02, 0.05, 0.10, 0.15, 0.20)
     sentence = "the camera stands {:g} m beside its place, in a random direction"
 
@@ -172,12 +178,11 @@ class CameraShift(Disturbance):
 
 
 @offer
-class Background(Disturbance):
+class Background(Visual):
     """Wall and floor are painted in another colour."""
 
     name = "background"
     kind = "appearance"
-    tasks = IMAGES
     levels = (0.1, 0.2, 0.4, 0.6, 0.8)
     sentence = "the colours of wall and floor are mixed with a share of {:g} of a new one"
     MATERIALS: ClassVar[tuple[str, ...]] = ("wall", "ground")
@@ -195,12 +200,11 @@ class Background(Disturbance):
 
 
 @offer
-class Occlusion(Disturbance):
+class Occlusion(Visual):
     """A square of the picture shows nothing any more, as with dirt on the lens."""
 
     name = "occlusion"
     kind = "sensing"
-    tasks = IMAGES
     levels = (0.10, 0.15, 0.25, 0.35, 0.45)
     sentence = "a square of {:g} times the width of the picture is one dark colour"
 
@@ -220,12 +224,11 @@ class Occlusion(Disturbance):
 
 
 @offer
-class PixelNoise(Disturbance):
+class PixelNoise(Visual):
     """Every pixel becomes noisy: Gaussian, white, keyed by (episode seed, step) and therefore repeatable."""
 
     name = "pixel-noise"
     kind = "sensing"
-    tasks = IMAGES
     levels = (0.02, 0.04, 0.08, 0.14, 0.22)
     sentence = "Gaussian noise of std {:g} times the full range is added to every pixel"
 
