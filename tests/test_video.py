@@ -80,7 +80,9 @@ def state(tiny_learner: Path) -> tuple[Any, Episode]:
     """An episode of the cart-pole, disturbed, that the expert takes over at step 30 if it lasts so long."""
     from safeswitch_baselines.learners.bayesian import BayesianLearner
 
-    return drive("SafeSwitch/CartPole-v0", BayesianLearner.load(tiny_learner), disturbance="cart-mass")
+    return drive(
+        "SafeSwitch/CartPole-v0", BayesianLearner.load(tiny_learner), disturbance="cart-mass", width=144, height=96
+    )
 
 
 @pytest.fixture(scope="module")
@@ -132,13 +134,12 @@ def test_tiles_of_a_state_task(state: tuple[Any, Episode]) -> None:
     env, episode = state
     plain, traced = replay_frames(env, episode, "rule"), replay_frames(env, episode, "rule", trace_of(episode, 0.06))
     assert not sees_images(env) and len(plain) == len(traced) == episode.length
-    assert plain[0].shape == (TILE, 288 + 2 * BORDER, 3)  # 480 x 320 at the tile's height
+    assert plain[0].shape == (TILE, 288 + 2 * BORDER, 3)  # 144 x 96 at the tile's height
     assert traced[0].shape == (TILE, 288 + TRACE + 3 * BORDER, 3)
     for step in (0, 29, 30, episode.length - 1):
         assert tuple(traced[step][-1, 0]) == COLOURS[Driver(int(episode.driver[step]))]
-    env.reset(seed=SEED)
-    again = replay_frames(env, episode, "rule")
-    assert all(np.array_equal(a, b) for a, b in zip(plain, again, strict=True))
+        scene = slice(BAR, BAR + HEIGHT), slice(BORDER, BORDER + 288)
+        assert np.array_equal(plain[step][scene], traced[step][scene])
 
 
 @pytest.mark.rendering

@@ -100,12 +100,14 @@ class Demonstrations:
         actions: (n, nu), clean expert labels in action units.
         episodes: (n,), index of the episode that a step belongs to.
         settings: how they were made (environment, seeds, noise).
+        executed: (n, nu), the actions that were executed, noise included; None where nobody kept them.
     """
 
     observations: NDArray[Any] | EpisodeFrames
     actions: NDArray[np.float64]
     episodes: NDArray[np.int64]
     settings: Mapping[str, Any] = field(default_factory=dict)
+    executed: NDArray[np.float64] | None = None
 
     def __len__(self) -> int:
         return len(self.observations)
@@ -246,7 +248,7 @@ def load(dataset_id: str, root: Path | str) -> Demonstrations:
         raise FileNotFoundError(f"no Minari dataset {dataset_id!r} below {root}; datasets there: {listing}")
     file = folder / "main_data.hdf5"
     settings = json.loads(json.loads((folder / "metadata.json").read_text(encoding="utf-8")).get(METADATA, "{}"))
-    observations, labels, lengths = [], [], []
+    observations, labels, executed, lengths = [], [], [], []
     with h5py.File(file, "r") as data:
         for index in range(len(data)):
             episode = data[f"episode_{index}"]
@@ -256,6 +258,7 @@ def load(dataset_id: str, root: Path | str) -> Demonstrations:
                 )
             lengths.append(len(episode["rewards"]))
             labels.append(episode["infos"]["expert_action"][: lengths[-1]])
+            executed.append(episode["actions"][: lengths[-1]])
             if not is_image(episode["observations"]):
                 observations.append(episode["observations"][: lengths[-1]])
     images = EpisodeFrames(file, lengths) if not observations else None
@@ -264,4 +267,5 @@ def load(dataset_id: str, root: Path | str) -> Demonstrations:
         np.concatenate(labels).astype(np.float64),
         np.repeat(np.arange(len(lengths)), lengths),
         settings,
+        np.concatenate(executed).astype(np.float64),
     )

@@ -131,7 +131,8 @@ class TrainingFeatures:
     @property
     def executed(self) -> Array:
         """(n, nu), executed actions in action units; the labels where demonstrations do not keep them."""
-        return getattr(self.demonstrations, "executed", self.demonstrations.actions)
+        executed = self.demonstrations.executed
+        return self.demonstrations.actions if executed is None else executed
 
 
 @dataclass(frozen=True)

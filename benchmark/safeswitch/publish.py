@@ -129,7 +129,7 @@ def _spread_row(cell: Cell, protocol: str, method: str, learner: int, seed: int,
 def figures_job(store: Store, task: Task, trained: Trained, episodes: Job, tables: CellTables, scores: Job) -> Job:
     """Figures and video of the first learner in the paper's cell."""
     keys = [*trained.keys, episodes.key, scores.key]
-    code = ["safeswitch.pictures", "safeswitch.scoring.figures", "safeswitch.scoring.video"]
+    code = ["safeswitch.pictures", "safeswitch.scoring"]
     arguments = (str(store.root), task, trained, episodes.key, tables, scores.key)
     return Job("figures", task.name, store.key("figures", {"task": task.name}, keys, code), pictures.draw, arguments)
 

@@ -123,6 +123,15 @@ class DropoutVGGLearner:
         action, epistemic_var, aleatoric_var = moments(output, self.model.actions, self.config.log_var_bounds)
         return Prediction(np.minimum(np.maximum(action, -1.0), 1.0), epistemic_var, aleatoric_var, features[0].copy())
 
+    def mean_action(self, observation: NDArray[Any], step: int) -> NDArray[np.float64]:
+        """Action (nu,) without dropout (weight scaling) for the next frame: what `predict` samples about, at less cost.
+
+        It takes the frame into the memory as `predict` does: in an episode, call the one or the other.
+        """
+        with one_thread(), torch.inference_mode():
+            mean, _ = self.model(self._stack.push(self._checked(observation)))
+        return np.clip(mean[0].numpy().astype(np.float64), -1.0, 1.0)
+
     def _checked(self, observation: NDArray[Any]) -> NDArray[np.uint8]:
         frame = np.asarray(observation)
         if frame.shape != self.encoding.observation_shape or frame.dtype != np.uint8:

@@ -2,7 +2,7 @@
 
     z      = whitened principal components of the trunk features
     z_t+1 ~= A' [1, z_t, a_t, cos(Omega [z_t, a_t] + phase)]     ridge regression with random Fourier features
-    value  = |W (z_t+1 - prediction)|, W' W = inverse covariance of the residuals in training
+    value  = |W (z_t+1 - prediction)|^2 / k, W' W = inverse covariance of the residuals in training
 
 One-step prediction error as novelty: Pathak et al. 2017, arXiv 1705.05363. Random Fourier features: Rahimi and Recht
 2007. The action a_t is the one that was executed, whoever drove.
@@ -22,9 +22,9 @@ from safeswitch_baselines.signals.features import Floats, norm, product, trunk_f
 
 
 class DynamicsResidual:
-    """Whitened one-step prediction error on the trunk features [-]; 0 at step 0, which nothing predicts.
+    """Whitened, squared one-step prediction error on the trunk features [-]; 0 at step 0, which nothing predicts.
 
-    Over the training steps its square has about the mean k, the number of principal axes.
+    Its mean over the training steps is about 1; k is the number of principal axes.
 
     Args:
         arrays: `mean` (d,), `axes` (k, d), `omega` (h, k + nu), `phase` (h,), `model` (k, 1 + k + nu + h) and
@@ -70,7 +70,7 @@ class DynamicsResidual:
             return 0.0
         inputs = np.concatenate([before, np.asarray(previous_action, np.float32)])
         regressors = _regressors(inputs[None], (product(self._omega, inputs) + self._phase)[None])[0]
-        return norm(product(self._whitening, point - product(self._model, regressors)))
+        return norm(product(self._whitening, point - product(self._model, regressors))) ** 2 / len(point)
 
 
 def _draw_lift(seed: int, count: int, size: int) -> tuple[Floats, Floats]:

@@ -1,9 +1,11 @@
 """Novelty of the trunk features: how far they are from those of the training steps, by three measures.
 
-    mahalanobis   sqrt((f - mu)' Sigma^-1 (f - mu))               Lee et al. 2018, arXiv 1807.03888
+    mahalanobis   (f - mu)' Sigma^-1 (f - mu) / d                 Lee et al. 2018, arXiv 1807.03888
     knn           distance to the 10th-nearest training feature   Sun et al. 2022, arXiv 2204.06507
-    rnd           RMS error of a network distilled from another   Burda et al. 2018, arXiv 1810.12894
+    rnd           error of a network distilled from another       Burda et al. 2018, arXiv 1810.12894
 
+They have no unit and are of the order of 1 at the training steps, so that rules which search for a threshold need not
+know the size of a network.
 Each is fitted once to a learner (`fit`, which needs torch) and then made from the fitted arrays; a step costs one or
 two products of a matrix and a vector. These are summed by `einsum` and not by BLAS, whose rounding may depend on the
 number of threads: an episode must give the same bits in every process.
@@ -55,9 +57,9 @@ def varying(features: Floats) -> NDArray[np.int64]:
 
 
 class Mahalanobis:
-    """Mahalanobis distance to the training features, with Ledoit and Wolf's shrunk covariance [-].
+    """Squared Mahalanobis distance to the training features, with Ledoit and Wolf's shrunk covariance, over d [-].
 
-    Over the training features its square has the mean d, up to the shrinkage; d is the number of features that vary.
+    Its mean over the training features is 1, up to the shrinkage; d is the number of features that vary.
 
     Args:
         arrays: `kept` (d,), indices of those features, `mean` (d,), `whitening` (d, d), W' W = Sigma^-1, and `size`.
@@ -89,11 +91,13 @@ class Mahalanobis:
     def update(self, observation: NDArray[Any], prediction: Prediction, previous_action: Array | None) -> float:
         """Value at this step."""
         features = trunk_features(self.id, prediction, self._size)
-        return norm(product(self._whitening, features[self._kept] - self._mean))
+        return norm(product(self._whitening, features[self._kept] - self._mean)) ** 2 / len(self._kept)
 
 
 class KNN:
     """Distance to the 10th-nearest of 5,000 training features on their first 32 whitened principal axes [-].
+
+    In units of the root mean square distance of the training features from their mean.
 
     Args:
         arrays: `mean` (d,), `axes` (k, d) and `reference` (m, k).
@@ -125,16 +129,19 @@ class KNN:
         apart = self._reference - product(self._axes, features - self._mean)
         squares = np.einsum("ij,ij->i", apart, apart)
         last = min(self.neighbour, len(squares)) - 1
-        return math.sqrt(float(np.partition(squares, last)[last]))
+        return math.sqrt(float(np.partition(squares, last)[last]) / len(self._axes))
 
 
 class RND:
-    """Random network distillation: RMS error of a network trained to imitate a fixed random one [-].
+    """Random network distillation: squared error of a network trained to imitate a fixed random one [-].
+
+    It is divided by the mean of this error over the training steps.
 
     Both read the training features standardised and, as in the paper, clipped to five standard deviations.
 
     Args:
-        arrays: `size`, `kept` (d,), `mean` (d,), `scale` (d,), and weights and biases of both networks, by layer.
+        arrays: `size`, `kept` (d,), `mean` (d,), `scale` (d,), `level`, the mean squared error over the training steps,
+            and weights and biases of both networks, by layer.
     """
 
     id = "rnd"
@@ -143,6 +150,7 @@ class RND:
     def __init__(self, arrays: Arrays) -> None:
         self._size = int(arrays["size"])
         self._kept, self._mean, self._scale = arrays["kept"], arrays["mean"], arrays["scale"]
+        self._level = float(arrays["level"])
         self._target, self._predictor = _layers(arrays, "target"), _layers(arrays, "predictor")
 
     @classmethod
@@ -170,7 +178,7 @@ class RND:
         features = trunk_features(self.id, prediction, self._size)
         inputs = _standardised(features[self._kept], self._mean, self._scale, self.clip)
         error = _perceptron(self._target, inputs) - _perceptron(self._predictor, inputs)
-        return norm(error) / math.sqrt(len(error))
+        return norm(error) ** 2 / (len(error) * self._level)
 
 
 def _standardised(features: Floats, mean: Floats, scale: Floats, clip: float) -> Floats:

@@ -112,7 +112,7 @@ def ridge(inputs: NDArray[Any], outputs: NDArray[Any], strength: float) -> tuple
 
 
 def distil(inputs: Floats, seed: int) -> dict[str, Floats]:
-    """A random target network and a predictor trained to imitate it on `inputs` (n, d), as named arrays.
+    """A random target network, a predictor trained to imitate it on `inputs` (n, d), and its mean squared error.
 
     Args:
         inputs: standardised features.
@@ -126,7 +126,9 @@ def distil(inputs: Floats, seed: int) -> dict[str, Floats]:
         with torch.inference_mode():
             wanted = target(x)
         _imitate(predictor, x, wanted.clone(), seed)
-    return {**_arrays(target, "target"), **_arrays(predictor, "predictor")}
+        with torch.inference_mode():
+            level = (predictor(x) - wanted).square().mean()
+    return {"level": level.numpy(), **_arrays(target, "target"), **_arrays(predictor, "predictor")}
 
 
 def _perceptron(widths: tuple[int, ...], seed: int, name: str) -> nn.Sequential:

@@ -65,7 +65,8 @@ class Ensemble:
     """Standard deviation of the mean actions of this learner and those of the other seeds [action units].
 
     Deep ensembles: Lakshminarayanan, Pritzel, Blundell 2017, arXiv 1612.01474. The members see every observation in
-    order, as a memory of frames needs, and their randomness is keyed by (0, step) in every episode.
+    order, as a memory of frames needs, and their randomness is keyed by (0, step) in every episode. A member that has
+    a `mean_action(observation, step)` is asked for this alone, which spares it the samples of its posterior.
 
     Args:
         members: learners of the other seeds, at least one.
@@ -89,10 +90,17 @@ class Ensemble:
 
     def update(self, observation: NDArray[Any], prediction: Prediction, previous_action: Array | None) -> float:
         """Value at this step."""
-        others = [member.predict(observation, self._step).action for member in self._others]
+        others = [_mean_action(member, observation, self._step) for member in self._others]
         self._step += 1
         components = np.array([prediction.action, *others], dtype=np.float64).T.tolist()
         return math.sqrt(math.fsum(_variance(values) for values in components))
+
+
+def _mean_action(member: Learner, observation: NDArray[Any], step: int) -> Array:
+    if hasattr(member, "mean_action"):
+        action: Array = member.mean_action(observation, step)
+        return action
+    return member.predict(observation, step).action
 
 
 def _variance(values: list[float]) -> float:

@@ -25,6 +25,9 @@ HINGE_HEIGHT = 0.85
 BEHIND, IN_FRONT = 0.35, -0.45
 """Where objects stand, seen from the rail, away from the camera [m]."""
 
+GREEN = 1.0 / 3.0
+"""Hue of green: neither cart (blue) nor pole (orange) nor bob (red)."""
+
 Sizes = dict[str, tuple[float, float, float]]
 
 
@@ -54,8 +57,8 @@ HELD_OUT: dict[str, Sizes] = {
 class Object(Visual):
     """An object that no training image shows appears, and stays: the paper's disturbance.
 
-    Kind, colour, size, turn and place are drawn; with the severity grow its size, and from severity 3 on it may stand
-    in front of the rail and cover cart or pole.
+    Kind, colour, size, turn and place are drawn. With the severity grow its size and the range of its colours, from
+    greens to all, those of cart and pole too; from severity 3 on it may stand in front of the rail and cover them.
     """
 
     name = "object"
@@ -63,6 +66,8 @@ class Object(Visual):
     levels = (0.06, 0.09, 0.13, 0.18, 0.24)
     sentence = "an object of up to {:g} m in radius appears in the picture"
     KINDS: ClassVar[dict[str, Sizes]] = KINDS
+    HUES: ClassVar[tuple[float, ...]] = (0.1, 0.2, 0.35, 0.65, 1.0)
+    """Width of the range of hues about green, 1 is all of them, per severity."""
     SMALLEST: ClassVar[float] = 0.5
     """Of the sizes that are drawn, as a share of the largest."""
 
@@ -71,14 +76,15 @@ class Object(Visual):
         kinds = list(self.KINDS)
         self._props = self.KINDS[kinds[int(rng.integers(len(kinds)))]]
         self._size = self.value * rng.uniform(self.SMALLEST, 1.0)
-        self._colour = colorsys.hsv_to_rgb(rng.random(), rng.uniform(0.6, 1.0), rng.uniform(0.4, 1.0))
+        hue = GREEN + self.HUES[self.severity - 1] * rng.uniform(-0.5, 0.5)
+        self._colour = colorsys.hsv_to_rgb(hue % 1.0, rng.uniform(0.6, 1.0), rng.uniform(0.4, 1.0))
         self._turn = rng.uniform(-math.pi / 2, math.pi / 2)
         self._place = self._draw_place(rng, horizon)
 
     def _draw_place(self, rng: np.random.Generator, horizon: int) -> NDArray[np.float64]:
         """(3,) [m]: somewhere about the rail."""
         depth = IN_FRONT if self.severity >= 3 and rng.random() < 0.5 else BEHIND
-        return np.array([rng.uniform(-0.9, 0.9), depth, HINGE_HEIGHT + rng.uniform(-0.5, 0.7)])
+        return np.array([rng.uniform(-0.95, 0.95), depth, HINGE_HEIGHT + rng.uniform(-0.8, 0.95)])
 
     def alter(self, nominal: mujoco.MjModel, model: mujoco.MjModel) -> None:
         """Put the object there, and nothing else of an earlier episode."""
@@ -94,10 +100,11 @@ class Object(Visual):
 
 @offer
 class ObjectHeldOut(Object):
-    """The same with kinds of object that `object` does not have: for tests only."""
+    """The same with kinds of object that `object` does not have, in any colour: for tests only."""
 
     name = "object-held-out"
     KINDS = HELD_OUT
+    HUES = (1.0,) * 5
 
 
 @offer
