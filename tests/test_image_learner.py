@@ -30,6 +30,7 @@ SETTINGS = {
     "dropout in one block": {"trunk_dropout": (0.0, 0.2), "feature_dropout": 0.0},
     "late dropout": {"feature_dropout": 0.0, "hidden_dropout": (0.0, 0.3)},
     "single frame": {"frames": 1},
+    "branches": {"channels": (4, 6), "branches": 2, "feature_dropout": 0.4},
 }
 
 

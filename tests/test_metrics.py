@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from safeswitch.handover import panel
 from safeswitch.scoring import TaskInfo, auroc, fpr_at_tpr, signal_quality, signal_table
 from safeswitch.scoring.metrics import PHI, episode_scores, prepare, returns, signal_of, summary
+from safeswitch.scoring.signal_quality import frame_quality
 
 T, DT = 100, 0.06
 INFOS = {"cart-pole": TaskInfo(horizon=T, control_dt=DT)}
@@ -210,9 +211,15 @@ def test_signal_quality_uses_the_right_frames_and_windows() -> None:
     assert quality.frame_auroc == pytest.approx(auroc(positive, negative))
     assert quality.fpr95 == fpr_at_tpr(positive, negative)
     assert quality.episode_auroc == 1.0  # only episode 0 counts: 5 against 2 on [1, 2]
-    active = np.zeros((2, 5), bool)
-    active[0, 2] = True
-    assert signal_quality(disturbed, twin, onset, t_first, alone, active).frame_auroc == 1.0
+    visible = np.zeros((2, 5), bool)
+    visible[0, 2] = True
+    shown = frame_quality(disturbed, twin, visible)
+    assert shown.frame_auroc == 1.0 and shown.fpr95 == 0.0 and np.isnan(shown.episode_auroc)
+    visible[1] = True
+    expected = auroc([5.0, *disturbed[1]], [2.0, *twin[1]])
+    assert frame_quality(disturbed, twin, visible).frame_auroc == expected
+    visible[0, 4] = True  # ended: left out on both sides
+    assert frame_quality(disturbed, twin, visible).frame_auroc == expected
     with pytest.raises(ValueError, match="onset"):
         signal_quality(disturbed, twin, np.array([-1, 2]), t_first, alone)
     with pytest.raises(ValueError, match="one shape"):

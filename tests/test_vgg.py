@@ -148,3 +148,26 @@ def test_wrong_settings_name_value_and_what_is_allowed(values, message):
 def test_too_many_blocks_for_an_image_are_refused():
     with pytest.raises(ValueError, match="few enough blocks"):
         VGGConfig(pools=4).block_shapes(64, 64)
+
+
+def test_branches_share_the_first_block_alone_and_are_dropped_whole():
+    config = VGGConfig.from_json(
+        {"channels": (4, 8), "strides": (2, 1), "pools": 1, "branches": 4, "feature_dropout": 0.5, "hidden": (6, 5)}
+    )
+    model = DropoutVGG((12, 12, 3), 1, config, torch.Generator().manual_seed(0))
+    stacks = torch.rand((2, 9, 12, 12), generator=torch.Generator().manual_seed(1))
+    before = model.trunk(stacks)
+    with torch.no_grad():
+        model.blocks[0].weight[1] += 0.5  # channel 1 of the first block is all that branch 1 reads
+    changed = (model.trunk(stacks) != before).reshape(2, 36, 8).any(dim=1)
+    assert changed[:, 2:4].any() and not changed[:, [0, 1, 4, 5, 6, 7]].any()
+
+    masks = config.layout(12, 12).draw(np.random.PCG64DXSM(0), 400)
+    features = masks[2]
+    assert features is not None and features.shape == (400, 36 * 8)
+    by_branch = features.reshape(400, 36, 4, 2)
+    assert (by_branch == by_branch[:, :1, :, :1]).all()
+    kept = by_branch[:, 0, :, 0]
+    assert abs(kept.mean() - 0.5) < 0.05 and len(np.unique(kept, axis=0)) == 16
+    with pytest.raises(ValueError, match="branches=3 is not allowed: branches must be a common divisor of channels"):
+        VGGConfig(branches=3)

@@ -18,6 +18,7 @@ from safeswitch import publish
 from safeswitch.console import Progress
 from safeswitch.scoring.metrics import TaskInfo
 from safeswitch.stages import (
+    CHUNK,
     CellTables,
     Job,
     demonstrations_job,
@@ -25,6 +26,7 @@ from safeswitch.stages import (
     fits_job,
     learner_job,
     make_env,
+    only_seen,
     signals_job,
     table_jobs,
 )
@@ -163,19 +165,29 @@ class Run:
             if cell.tag != "none"
         }
         none = str(self.task.none_cell)
+        chunks = -(-self.profile.signal_episodes // CHUNK)
         jobs = [
-            signals_job(self.store, self.task, cell, self.trained[seed], keys, tables[seed, none].test[: len(keys)])
+            signals_job(
+                self.store,
+                self.task,
+                cell,
+                self.trained[seed],
+                keys,
+                tables[seed, none].test[: None if cell in self.profile.cells_of(self.task) else chunks],
+            )
             for (seed, cell), keys in {**test, **further}.items()
         ]
         self.finish("signal quality", jobs)
         return jobs
 
     def _further_tables(self) -> dict[tuple[int, Cell], tuple[str, ...]]:
-        """Tables of the cells in which only signals are scored, on the first test episodes."""
+        """Tables of the cells in which only signals are scored; none where only the picture is disturbed."""
         profile = self.profile
         count = min(profile.signal_episodes, profile.test)
         chunks = {
-            (trained.seed, cell): table_jobs(self.store, self.task, cell, "test", count, trained)
+            (trained.seed, cell): []
+            if only_seen(cell)
+            else table_jobs(self.store, self.task, cell, "test", count, trained)
             for trained in self.trained
             for cell in self.task.severities(*profile.signal_severities)
         }

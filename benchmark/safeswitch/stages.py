@@ -7,8 +7,8 @@ pure function of its arguments, so the bits do not depend on the number of worke
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,13 +17,13 @@ import pandas as pd
 
 from safeswitch import demos, registry
 from safeswitch.files import load_frame, save_arrays, save_frame
-from safeswitch.handover.clean import clean_traces
 from safeswitch.handover.episode import run_episode
 from safeswitch.handover.panel import Calibration, Panel
+from safeswitch.handover.shown import shown_traces
 from safeswitch.handover.table import HandoverTable, concatenate, join_chunks, record_table
-from safeswitch.protocols import ARMINGS, Arming, Array, TrainingFeatures
+from safeswitch.protocols import ARMINGS, Arming, TrainingFeatures
 from safeswitch.scoring.rows import episode_rows, latched_rows
-from safeswitch.scoring.signal_quality import signal_quality
+from safeswitch.scoring.signal_quality import SignalQuality, frame_quality, signal_quality
 from safeswitch.store import Key, Store
 from safeswitch.suite import Cell, Profile, Split, Task, episode_seeds, methods
 from safeswitch.trained import Trained, base_signals, fitted_signals, load_learner
@@ -303,9 +303,13 @@ def labelled(
 def signals_job(
     store: Store, task: Task, cell: Cell, trained: Trained, disturbed: tuple[str, ...], twins: tuple[str, ...]
 ) -> Job:
-    """Signal quality of one (learner, cell), from the tables of test episodes and of their undisturbed twins."""
+    """Signal quality of one (learner, cell), from tables of test episodes (or none) and of their undisturbed twins.
+
+    A disturbance that is only seen is judged on the twins' states, with and without it in view; then no disturbed
+    episode is needed for the frames.
+    """
     settings = {"cell": str(cell), "learner_seed": trained.seed, "signals": list(task.signals)}
-    code = ["safeswitch.scoring.signal_quality", "safeswitch.handover.table", "safeswitch.handover.clean"]
+    code = ["safeswitch.scoring.signal_quality", "safeswitch.handover.table", "safeswitch.handover.shown"]
     key = store.key("signals", settings, [*trained.keys, *disturbed, *twins], code)
     arguments = (str(store.root), task, cell, trained, disturbed, twins)
     return Job("signals", f"{cell} learner {trained.seed}", key, _score_signals, arguments)
@@ -321,25 +325,22 @@ def _score_signals(
     twin_keys: tuple[str, ...],
 ) -> None:
     store = Store(Path(root))
-    disturbed = load_table(store, task, cell, disturbed_keys)
-    twins: Mapping[str, Array]
+    twins = load_table(store, task, task.none_cell, twin_keys)
+    by_signal: dict[str, SignalQuality] = {}
+    if disturbed_keys:
+        disturbed = load_table(store, task, cell, disturbed_keys)
+        about = (disturbed.onset, disturbed.t_first, disturbed.learner_success)
+        for signal in task.signals:
+            by_signal[signal] = signal_quality(disturbed.signals[signal], twins.signals[signal], *about)
     if only_seen(cell):
         env = make_env(task, cell)
-        twins, active = clean_traces(env, trained.learner(task), trained.signals(task), disturbed)
+        shown, visible = shown_traces(env, trained.learner(task), trained.signals(task), twins)
         env.close()
-    else:
-        twins, active = load_table(store, task, task.none_cell, twin_keys).signals, None
-    rows = []
-    for signal in task.signals:
-        quality = signal_quality(
-            disturbed.signals[signal],
-            twins[signal],
-            disturbed.onset,
-            disturbed.t_first,
-            disturbed.learner_success,
-            active,
-        )
-        rows.append({"signal": signal, **asdict(quality)})
+        for signal in task.signals:
+            frames = frame_quality(shown[signal], twins.signals[signal], visible)
+            before = by_signal.get(signal, frames)
+            by_signal[signal] = replace(frames, episode_auroc=before.episode_auroc)
+    rows = [{"signal": signal, **asdict(quality)} for signal, quality in by_signal.items()]
     frame = pd.DataFrame(rows).assign(
         task=cell.task, disturbance=cell.disturbance, severity=cell.severity, learner=trained.seed
     )

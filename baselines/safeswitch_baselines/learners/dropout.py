@@ -30,18 +30,25 @@ class MaskLayout:
     Attributes:
         columns: the block's columns of each layer; None for a layer without dropout.
         limits: (units,), smallest number that keeps each unit.
+        groups: of each layer, None or (width,) the dropout unit that each of its numbers belongs to.
     """
 
     columns: tuple[slice | None, ...]
     limits: NDArray[np.uint16]
+    groups: tuple[NDArray[np.intp] | None, ...]
 
     @classmethod
-    def of(cls, widths: Sequence[int], rates: Sequence[float]) -> MaskLayout:
-        """Layout of layers with these widths and dropout rates."""
+    def of(
+        cls,
+        widths: Sequence[int],
+        rates: Sequence[float],
+        groups: Sequence[NDArray[np.intp] | None] | None = None,
+    ) -> MaskLayout:
+        """Layout of layers with these numbers of dropout units and these rates."""
         used = [width if rate > 0 else 0 for width, rate in zip(widths, rates, strict=True)]
         limits = np.repeat([round(rate * 65536) for rate in rates], used).astype(np.uint16)
         columns = tuple(slice(int(a), int(b)) if b > a else None for a, b in pairwise(np.cumsum([0, *used])))
-        return cls(columns, limits)
+        return cls(columns, limits, (None,) * len(columns) if groups is None else tuple(groups))
 
     def words(self, rows: int) -> int:
         """64-bit words that `rows` rows take from a bit generator."""
@@ -51,7 +58,10 @@ class MaskLayout:
         """Independent masks, one (rows, width) per layer; True keeps the unit."""
         numbers = bits.random_raw(self.words(rows)).view(np.uint16)[: rows * len(self.limits)]
         keep = numbers.reshape(rows, len(self.limits)) >= self.limits
-        return [None if columns is None else keep[:, columns] for columns in self.columns]
+        return [
+            None if columns is None else keep[:, columns] if group is None else keep[:, columns][:, group]
+            for columns, group in zip(self.columns, self.groups, strict=True)
+        ]
 
 
 class MaskStream:

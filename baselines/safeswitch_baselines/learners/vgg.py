@@ -42,7 +42,11 @@ class VGGConfig(TrainingConfig):
         hidden: width of each fully connected layer.
         trunk_dropout: chance to drop a unit after each block, one rate or one per block. Where it is not 0, every
             sample of a decision runs the whole trunk.
-        feature_dropout: the same on the flattened features of the trunk.
+        branches: B, parts into which the channels of the trunk are split after the first block, each a small network
+            of its own (grouped convolutions). A divisor of all channels.
+        feature_dropout: the same on the flattened features of the trunk; with branches, whole branches are dropped:
+            a decision then asks subsets of networks that were trained together, which agree on what training showed
+            and on little else (Durasov et al. 2021, arXiv 2012.08334).
         hidden_dropout: the same after each fully connected layer, one rate or one per layer.
         standardisation: "per-pixel" (mean and deviation of every pixel and channel over the training images),
             "centred" (mean of every channel, no division) or "none"; of pixels in [0, 1].
@@ -56,6 +60,7 @@ class VGGConfig(TrainingConfig):
     pools: int | tuple[int, ...] = (2, 2, 2, 1)
     hidden: tuple[int, ...] = (128, 64)
     trunk_dropout: float | tuple[float, ...] = 0.0
+    branches: int = 1
     feature_dropout: float = 0.2
     hidden_dropout: float | tuple[float, ...] = (0.3, 0.0)
     standardisation: str = "per-pixel"
@@ -79,6 +84,9 @@ class VGGConfig(TrainingConfig):
         if self.standardisation not in STANDARDISATIONS:
             raise unknown("standardisation", self.standardisation, STANDARDISATIONS)
         require(self.pixel_floor > 0, "pixel_floor", self.pixel_floor, "a positive number")
+        for channels in self.channels:
+            fits = self.branches >= 1 and channels % self.branches == 0
+            require(fits, "branches", self.branches, "a common divisor of channels")
         for name in ("frames", "pool_episodes"):
             require(getattr(self, name) >= 1, name, getattr(self, name), "a positive integer")
         super()._check()
@@ -121,7 +129,12 @@ class VGGConfig(TrainingConfig):
     def layout(self, height: int, width: int) -> MaskLayout:
         """Layout of the masks of trunk and head for images of this size."""
         blocks = [int(np.prod(shape)) for shape in self.block_shapes(height, width)]
-        return MaskLayout.of((*blocks, blocks[-1], *self.hidden), self.rates)
+        if self.branches == 1:
+            return MaskLayout.of((*blocks, blocks[-1], *self.hidden), self.rates)
+        channel = np.arange(blocks[-1]) % self.channels[-1]  # features are flattened pixel by pixel
+        branch = channel // (self.channels[-1] // self.branches)
+        groups = (*[None] * len(blocks), branch, *[None] * len(self.hidden))
+        return MaskLayout.of((*blocks, self.branches, *self.hidden), self.rates, groups)
 
 
 @dataclass(frozen=True)
@@ -188,8 +201,8 @@ class DropoutVGG(nn.Module):
         inputs = (config.frames * depth, *config.channels)
         # `skip_init`: a plain layer would draw its weights from the global generator.
         self.blocks = nn.ModuleList(
-            nn.utils.skip_init(nn.Conv2d, a, b, 3, padding=1, stride=stride)
-            for (a, b), (stride, _) in zip(pairwise(inputs), config.factors(), strict=True)
+            nn.utils.skip_init(nn.Conv2d, a, b, 3, padding=1, stride=stride, groups=config.branches if block else 1)
+            for block, ((a, b), (stride, _)) in enumerate(zip(pairwise(inputs), config.factors(), strict=True))
         )
         widths = (self.features, *config.hidden)
         self.layers = nn.ModuleList(nn.utils.skip_init(nn.Linear, a, b) for a, b in pairwise(widths))

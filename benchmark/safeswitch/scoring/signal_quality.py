@@ -57,38 +57,53 @@ def signal_quality(
     onset: NDArray[np.integer],
     t_first: Array,
     learner_success: NDArray[np.bool_],
-    active: NDArray[np.bool_] | None = None,
 ) -> SignalQuality:
-    """Quality of a signal from disturbed episodes and what it shows without the disturbance.
+    """Quality of a signal from disturbed episodes and their undisturbed twins.
 
     Args:
         disturbed: (E, T) signal on the learner-only disturbed trajectories, NaN after an early end.
-        twin: (E, T) signal without the disturbance: on the undisturbed twins (dynamics, actuation, sensing), or on
-            the same states rendered without it (images).
+        twin: (E, T) signal on the undisturbed twins.
         onset: (E,) step t0.
         t_first: (E,) `t*_first`, NaN where there is none.
         learner_success: (E,) whether the learner alone succeeds in the disturbed episode.
-        active: (E, T) where the disturbance is visible or active; None for every step from t0 on.
 
     Steps at which either trajectory has already ended are left out on both sides.
     """
-    disturbed, twin = np.asarray(disturbed, float), np.asarray(twin, float)
-    if disturbed.shape != twin.shape or disturbed.ndim != 2:
-        raise ValueError(f"traces must be two arrays (E, T) of one shape, got {disturbed.shape} and {twin.shape}")
+    disturbed, twin = _traces(disturbed, twin)
     onset = np.asarray(onset)
     if np.any(onset < 0):
         raise ValueError("signal quality is defined on disturbed episodes: every onset must be >= 0")
     steps = np.arange(disturbed.shape[1])
     both = ~np.isnan(disturbed) & ~np.isnan(twin)
     after = steps[None, :] >= onset[:, None]
-    frames = both & (after if active is None else np.asarray(active, bool))
-    positive, negative = disturbed[frames], twin[frames]
+    frames = both & after
     judged = ~np.asarray(learner_success, bool) & np.isfinite(t_first)
     last = np.where(judged, t_first, -1.0)
-    window = both & after & (steps[None, :] <= last[:, None])
+    window = frames & (steps[None, :] <= last[:, None])
     episodes = window.any(axis=1)
     peak = [np.where(window, trace, -np.inf).max(axis=1)[episodes] for trace in (disturbed, twin)]
+    positive, negative = disturbed[frames], twin[frames]
     return SignalQuality(auroc(positive, negative), auroc(*peak), fpr_at_tpr(positive, negative))
+
+
+def frame_quality(shown: Array, clean: Array, visible: NDArray[np.bool_]) -> SignalQuality:
+    """Quality of a signal on the same states with and without the disturbance in view; no episodes are judged.
+
+    Args:
+        shown: (E, T) signal with the disturbance in view, NaN after an early end.
+        clean: (E, T) signal without it.
+        visible: (E, T) where the disturbance shows.
+    """
+    shown, clean = _traces(shown, clean)
+    frames = ~np.isnan(shown) & ~np.isnan(clean) & np.asarray(visible, bool)
+    return SignalQuality(auroc(shown[frames], clean[frames]), np.nan, fpr_at_tpr(shown[frames], clean[frames]))
+
+
+def _traces(disturbed: Array, clean: Array) -> tuple[Array, Array]:
+    disturbed, clean = np.asarray(disturbed, float), np.asarray(clean, float)
+    if disturbed.shape != clean.shape or disturbed.ndim != 2:
+        raise ValueError(f"traces must be two arrays (E, T) of one shape, got {disturbed.shape} and {clean.shape}")
+    return disturbed, clean
 
 
 def signal_table(per_learner: pd.DataFrame) -> pd.DataFrame:

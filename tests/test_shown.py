@@ -1,0 +1,98 @@
+"""The same states seen with a disturbance: what signals are judged by on images."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from safeswitch.handover.shown import shown_traces
+from safeswitch.handover.table import HandoverTable, record_table
+from safeswitch.protocols import Array, Prediction
+from safeswitch.tasks.cart_pole_image import CartPoleImageEnv
+
+pytestmark = pytest.mark.rendering
+
+SEEDS = [3, 4, 5]
+
+
+class Brightness:
+    """A learner with a memory: it pushes to the side on which the last two frames are darker."""
+
+    def reset(self, seed: int) -> None:
+        self._before = 0.0
+
+    def predict(self, observation: NDArray[Any], step: int) -> Prediction:
+        half = observation.astype(float).mean(axis=(0, 2))
+        side = float(half[:32].mean() - half[32:].mean()) / 255.0
+        action = np.array([0.5 * (side + self._before)])
+        self._before = side
+        return Prediction(action, action**2, np.zeros(1), observation.ravel()[:8].astype(np.float32))
+
+
+class Seen:
+    """Signals with a memory too: the mean of all pixels, minus the one before, and the executed action before."""
+
+    id = "seen"
+
+    def reset(self) -> None:
+        self._before = 0.0
+
+    def update(self, observation: NDArray[Any], prediction: Prediction, previous_action: Array | None) -> float:
+        value = float(observation.mean())
+        change = value - self._before + (0.0 if previous_action is None else 100.0 * float(previous_action[0]))
+        self._before = value
+        return change + float(prediction.epistemic_var[0])
+
+
+def recorded(name: str | None = None) -> HandoverTable:
+    """A table of three episodes."""
+    env = CartPoleImageEnv(name)
+    return record_table(env, Brightness(), [Seen()], env.make_expert(), SEEDS)
+
+
+def test_before_the_onset_it_is_the_recorded_signal_and_afterwards_it_is_not() -> None:
+    table = recorded()
+    for name in ("object", "pixel-noise", "lighting"):
+        env = CartPoleImageEnv(name, 5)
+        traces, visible = shown_traces(env, Brightness(), [Seen()], table)
+        for episode, seed in enumerate(table.seeds):
+            env.reset(seed=int(seed))
+            onset, length = env.onset, int(table.length[episode])
+            np.testing.assert_array_equal(traces["seen"][episode, :onset], table.signals["seen"][episode, :onset])
+            assert not visible[episode, :onset].any()
+            if length > onset:
+                assert visible[episode, onset:length].mean() > 0.5
+                assert traces["seen"][episode, onset] != table.signals["seen"][episode, onset]
+            assert np.isnan(traces["seen"][episode, length:]).all() and not visible[episode, length:].any()
+
+
+def test_it_is_what_the_learner_would_say_if_it_did_not_react() -> None:
+    """Driven by the recorded actions, the disturbed task visits the undisturbed states."""
+    table = recorded()
+    traces, _ = shown_traces(CartPoleImageEnv("object", 5), Brightness(), [Seen()], table)
+    env, twin, signal, learner = CartPoleImageEnv("object", 5), CartPoleImageEnv(), Seen(), Brightness()
+    for each in (env, twin):
+        each.reset(seed=SEEDS[0])
+    learner.reset(SEEDS[0])
+    signal.reset()
+    previous = None
+    assert table.snapshots is not None
+    for step in range(int(table.length[0])):
+        observation = env.observe()
+        value = signal.update(observation, learner.predict(observation, step), previous)
+        assert value == traces["seen"][0, step]
+        twin.restore(table.snapshots[0, step + 1])
+        previous = twin.simulator.data.ctrl.copy()
+        env.advance(previous)
+        np.testing.assert_array_equal(env.state, twin.state)
+
+
+def test_tables_that_hold_no_undisturbed_states_are_refused() -> None:
+    env = CartPoleImageEnv("object")
+    with pytest.raises(ValueError, match="snapshots"):
+        shown_traces(env, Brightness(), [Seen()], recorded().take(np.array([0])))
+    with pytest.raises(ValueError, match="disturbed ones"):
+        shown_traces(env, Brightness(), [Seen()], recorded("object"))
