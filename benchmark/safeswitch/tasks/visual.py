@@ -113,7 +113,7 @@ class ObjectPassing(Object):
 
     name = "object-passing"
     sentence = "an object of up to {:g} m in radius passes through the picture"
-    START: ClassVar[float] = 1.6
+    START: ClassVar[float] = 1.5
     """Distance from the middle at which it enters, and leaves [m]: just out of view."""
     STEPS: ClassVar[tuple[int, int]] = (20, 30)
     """Control steps that it takes."""
@@ -138,7 +138,7 @@ class ObjectFar(Object):
 
     name = "object-far"
     benign = True
-    levels = (0.04, 0.06, 0.08, 0.10, 0.12)
+    levels = (0.03, 0.04, 0.05, 0.06, 0.07)
     sentence = "an object of up to {:g} m in radius appears in an upper corner"
 
     def _draw_place(self, rng: np.random.Generator, horizon: int) -> NDArray[np.float64]:
