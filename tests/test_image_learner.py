@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import os
 import pickle
 import subprocess
@@ -30,6 +31,7 @@ SETTINGS = {
     "dropout in one block": {"trunk_dropout": (0.0, 0.2), "feature_dropout": 0.0},
     "late dropout": {"feature_dropout": 0.0, "hidden_dropout": (0.0, 0.3)},
     "single frame": {"frames": 1},
+    "frames as they are": {"differences": False},
     "branches": {"channels": (4, 6), "branches": 2, "feature_dropout": 0.4},
 }
 
@@ -62,11 +64,14 @@ def test_a_decision_is_the_plain_network_under_each_mask(name):
     stream = MaskStream(config.layout(*SHAPE[:2]), config.samples)
     for array in (stream, learner):
         array.reset(5)
-    unit = FRAMES.astype(np.float32) * encoding.scale + encoding.offset
+    unit = FRAMES.astype(np.float32)
+    scale, offset = encoding.factors(config.frames)
     for step in range(5):
         prediction = learner.predict(FRAMES[step], step)
         rows = [max(step - back, 0) for back in reversed(range(config.frames))]  # oldest first
-        stack = torch.from_numpy(np.concatenate([unit[row] for row in rows], axis=2)).permute(2, 0, 1)[None]
+        older = [unit[b] - unit[a] if config.differences else unit[a] for a, b in itertools.pairwise(rows)]
+        encoded = np.concatenate([*older, unit[rows[-1]]], axis=2) * scale + offset
+        stack = torch.from_numpy(encoded).permute(2, 0, 1)[None]
         means, variances = [], []
         for k in range(config.samples):
             masks = [None if mask is None else mask[k : k + 1] for mask in stream.draw(step)]
@@ -114,9 +119,10 @@ def test_features_are_kept_when_the_next_decision_is_made():
     np.testing.assert_array_equal(first.features, copy)
 
 
+@pytest.mark.parametrize("differences", [True, False])
 @pytest.mark.parametrize("frames", [1, 2, 3])
-def test_stacks_in_training_are_those_of_the_decisions(frames):
-    encoding = PixelEncoding.fit([FRAMES], VGGConfig())
+def test_stacks_in_training_are_those_of_the_decisions(frames, differences):
+    encoding = PixelEncoding.fit([FRAMES], VGGConfig(differences=differences))
     demos = demonstrations()
     order = [2, 0, 1]
     pool = Pool.read(demos, order, frames)

@@ -25,10 +25,7 @@ def network(shape=(16, 20, 3), actions: int = 1, **options) -> DropoutVGG:
 
 def encoded(frames: np.ndarray, config: VGGConfig) -> np.ndarray:
     encoding = PixelEncoding.fit([frames], config)
-    out = np.empty(frames.shape, np.float32)
-    for frame, place in zip(frames, out, strict=True):
-        encoding(frame, place)
-    return out
+    return frames * encoding.scale + encoding.offset
 
 
 @pytest.mark.parametrize("shape", [(64, 64, 3), (48, 96, 3)])
@@ -114,6 +111,22 @@ def test_pixel_statistics_do_not_depend_on_order_or_pools():
     whole = PixelEncoding.fit([frames], VGGConfig())
     parts = PixelEncoding.fit([frames[25:], frames[:10], frames[10:25]], VGGConfig())
     assert whole.scale.tobytes() == parts.scale.tobytes() and whole.offset.tobytes() == parts.offset.tobytes()
+
+
+def test_differences_are_measured_by_their_own_size_per_pixel():
+    frames = images(40)
+    frames[:, 2, 5] = 9  # a pixel that never changes
+    step = np.diff(frames / 255.0, axis=0)
+    encoding = PixelEncoding.fit([frames], VGGConfig())
+    expected = 1.0 / (255.0 * (np.sqrt((step**2).sum(axis=0) / 40) + 0.03))
+    np.testing.assert_allclose(encoding.change, expected, rtol=1e-5)
+    assert PixelEncoding.fit([frames], VGGConfig(differences=False)).change is None
+    scale, offset = encoding.factors(3)
+    assert scale.shape == offset.shape == (*frames.shape[1:3], 9)
+    np.testing.assert_array_equal(scale[..., 3:], np.concatenate([encoding.change, encoding.scale], axis=2))
+    assert (offset[..., :6] == 0).all()
+    apart = PixelEncoding.fit([frames[:20], frames[20:]], VGGConfig())  # no difference across episodes
+    assert (apart.change >= encoding.change).all() and (apart.change > encoding.change).any()
 
 
 def test_config_survives_json():

@@ -29,19 +29,20 @@ FORMAT = "safeswitch-dropout-vgg-1"
 
 
 class FrameStack:
-    """The last F frames, encoded when they arrive and not again.
+    """The last F frames, and from them what the network sees.
 
     Args:
-        encoding: of a frame.
+        encoding: of a stack.
         frames: F.
     """
 
     def __init__(self, encoding: PixelEncoding, frames: int) -> None:
-        self._encoding = encoding
         height, width, self._depth = encoding.observation_shape
-        self._stack = np.zeros((1, height, width, frames * self._depth), np.float32)
-        self._tensor = torch.from_numpy(self._stack).permute(0, 3, 1, 2)
-        self._frame = np.zeros(encoding.observation_shape, np.float32)
+        self._differences = encoding.change is not None
+        self._scale, self._offset = encoding.factors(frames)
+        self._frames = np.zeros((height, width, frames * self._depth), np.float32)
+        self._encoded = np.zeros((1, *self._frames.shape), np.float32)
+        self._tensor = torch.from_numpy(self._encoded).permute(0, 3, 1, 2)
         self.reset()
 
     def reset(self) -> None:
@@ -49,15 +50,19 @@ class FrameStack:
         self._empty = True
 
     def push(self, frame: NDArray[np.uint8]) -> torch.Tensor:
-        """Take the next frame (H, W, C) in; the stack (1, F C, H, W), valid until the next call."""
-        self._encoding(frame, self._frame)
-        depth = self._depth
+        """Take the next frame (H, W, C) in; the encoded stack (1, F C, H, W), valid until the next call."""
+        depth, frames, encoded = self._depth, self._frames, self._encoded[0]
         if self._empty:
-            self._stack[0] = np.tile(self._frame, self._stack.shape[-1] // depth)
+            frames[...] = np.tile(frame, frames.shape[-1] // depth)
             self._empty = False
         else:
-            self._stack[..., :-depth] = self._stack[..., depth:]
-            self._stack[0, ..., -depth:] = self._frame
+            frames[..., :-depth] = frames[..., depth:]
+            frames[..., -depth:] = frame
+        encoded[...] = frames
+        if self._differences:
+            encoded[..., :-depth] = frames[..., depth:] - frames[..., :-depth]
+        np.multiply(encoded, self._scale, out=encoded)
+        np.add(encoded, self._offset, out=encoded)
         return self._tensor
 
 
@@ -171,6 +176,8 @@ class DropoutVGGLearner:
         tensors = {f"network.{key}": value for key, value in self.model.state_dict().items()}
         tensors["encoding.scale"] = torch.from_numpy(self.encoding.scale)
         tensors["encoding.offset"] = torch.from_numpy(self.encoding.offset)
+        if self.encoding.change is not None:
+            tensors["encoding.change"] = torch.from_numpy(self.encoding.change)
         description = {
             "observation_shape": self.encoding.observation_shape,
             "actions": self.model.actions,
@@ -184,7 +191,8 @@ class DropoutVGGLearner:
         """Learner saved by `save`; it predicts the same bits on the same machine."""
         tensors, description = storage.read(folder, FORMAT)
         config = VGGConfig.from_json(description["config"])
-        encoding = PixelEncoding(*(tensors.pop(f"encoding.{name}").numpy().copy() for name in ("scale", "offset")))
+        parts = {name.removeprefix("encoding."): tensors.pop(name) for name in list(tensors) if "encoding." in name}
+        encoding = PixelEncoding(**{name: value.numpy().copy() for name, value in parts.items()})
         state = {key.removeprefix("network."): value for key, value in tensors.items()}
         return cls(_network_of(state, encoding, config), encoding, config, description["history"])
 

@@ -88,9 +88,8 @@ class Encoder:
 
     def __init__(self, encoding: PixelEncoding, frames: int, rows: int, device: torch.device) -> None:
         height, width, depth = encoding.observation_shape
-        self._scale, self._offset = (
-            torch.from_numpy(np.tile(value, frames)).to(device) for value in (encoding.scale, encoding.offset)
-        )
+        self._scale, self._offset = (torch.from_numpy(value).to(device) for value in encoding.factors(frames))
+        self._differences = encoding.change is not None
         self._frames = torch.empty(rows, frames * depth, height, width, dtype=torch.uint8)
         self._pixels = torch.empty(rows, height, width, frames * depth, dtype=torch.uint8)
         self._encoded = torch.empty(rows, height, width, frames * depth, device=device)
@@ -104,6 +103,8 @@ class Encoder:
         torch.index_select(pool.frames, 0, pool.stacks[rows].flatten(), out=each_frame)
         pixels.copy_(frames.permute(0, 2, 3, 1))  # while they are bytes: a quarter of the memory to go through
         encoded.copy_(pixels)
+        if self._differences:
+            encoded[..., : -self._depth] = encoded[..., self._depth :] - encoded[..., : -self._depth]
         torch.addcmul(self._offset, encoded, self._scale, out=encoded)
         return encoded.permute(0, 3, 1, 2)
 

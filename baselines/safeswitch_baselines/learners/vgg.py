@@ -51,6 +51,8 @@ class VGGConfig(TrainingConfig):
         standardisation: "per-pixel" (mean and deviation of every pixel and channel over the training images),
             "centred" (mean of every channel, no division) or "none"; of pixels in [0, 1].
         pixel_floor: added to the deviation, so that constant pixels are divided by this.
+        differences: whether the older frames enter as differences of neighbouring frames, in units of their own size:
+            what moves then need not be found as a small difference of large numbers.
         pool_episodes: episodes held in memory at a time, as uint8; all of them stay there if they are no more.
     """
 
@@ -65,6 +67,7 @@ class VGGConfig(TrainingConfig):
     hidden_dropout: float | tuple[float, ...] = (0.3, 0.0)
     standardisation: str = "per-pixel"
     pixel_floor: float = 0.03
+    differences: bool = True
     pool_episodes: int = 100
     loss: str = "beta-nll"
     warmup_epochs: int = 3
@@ -139,45 +142,61 @@ class VGGConfig(TrainingConfig):
 
 @dataclass(frozen=True)
 class PixelEncoding:
-    """Frame (H, W, C) uint8 -> network input `frame * scale + offset`, float32.
+    """Stack of frames, uint8 -> network input, float32.
+
+    The newest frame enters as `frame * scale + offset`. The older ones do too, or, with `change`, in their place the
+    differences of neighbouring frames, `(frame - frame before) * change`.
 
     Attributes:
         scale: (H, W, C), float32.
         offset: (H, W, C), float32.
+        change: (H, W, C), float32; None where frames enter as they are.
     """
 
     scale: NDArray[np.float32]
     offset: NDArray[np.float32]
+    change: NDArray[np.float32] | None = None
 
     @classmethod
     def fit(cls, episodes: Iterable[NDArray[np.uint8]], config: VGGConfig) -> PixelEncoding:
         """Statistics of the training images, (L, H, W, C) an episode, in one pass; their order does not matter."""
-        count, total, squares = 0, np.zeros((), np.int64), np.zeros((), np.int64)
+        count, total, squares, changes = 0, *(np.zeros((), np.int64) for _ in range(3))
         for frames in episodes:
             # Integers: the sums are exact, and the same bits in whichever order they are made.
             count += len(frames)
             total = total + frames.sum(axis=0, dtype=np.int64)
-            squares = squares + np.einsum("n...,n...->...", frames, frames, dtype=np.int64)
+            squares = squares + _squares(frames)
+            changes = changes + _squares(np.diff(frames.astype(np.int16), axis=0))
         mean = total / count
         deviation = np.sqrt(np.maximum(squares / count - mean**2, 0.0)) / 255.0
+        change = np.sqrt(changes / count) / 255.0
         mean /= 255.0
         if config.standardisation == "per-pixel":
-            divisor = deviation + config.pixel_floor
+            divisor, change = deviation + config.pixel_floor, change + config.pixel_floor
         else:
-            divisor = np.ones_like(mean)
+            divisor = change = np.ones_like(mean)
             mean = np.broadcast_to(mean.mean(axis=(0, 1)), mean.shape) * (config.standardisation == "centred")
-        scale, offset = 1.0 / (255.0 * divisor), -mean / divisor
-        return cls(scale.astype(np.float32), offset.astype(np.float32))
+        scale, offset, change = 1.0 / (255.0 * divisor), -mean / divisor, 1.0 / (255.0 * change)
+        differences = change.astype(np.float32) if config.differences else None
+        return cls(scale.astype(np.float32), offset.astype(np.float32), differences)
 
     @property
     def observation_shape(self) -> tuple[int, ...]:
         """Shape of a frame, (H, W, C)."""
         return self.scale.shape
 
-    def __call__(self, frame: NDArray[Any], out: NDArray[np.float32]) -> None:
-        """Write the encoded `frame` (H, W, C) into `out`."""
-        np.multiply(frame, self.scale, out=out)
-        np.add(out, self.offset, out=out)
+    def factors(self, frames: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Scale and offset (H, W, F C) of a whole stack, oldest first, after differences were taken."""
+        if self.change is None:
+            return np.tile(self.scale, frames), np.tile(self.offset, frames)
+        older = frames - 1
+        scales = [*[self.change] * older, self.scale]
+        return np.concatenate(scales, axis=2), np.concatenate([*[0 * self.offset] * older, self.offset], axis=2)
+
+
+def _squares(frames: NDArray[Any]) -> NDArray[np.int64]:
+    """Sum of the squares over the frames (n, H, W, C), (H, W, C)."""
+    return np.einsum("n...,n...->...", frames, frames, dtype=np.int64)
 
 
 class DropoutVGG(nn.Module):

@@ -33,12 +33,33 @@ RAIL = 1.0
 class CartPoleImageEnv(CartPoleEnv):
     """Swing the pole up from hanging, and keep it upright without leaving the rail, from pictures alone.
 
-    Dynamics, action, reward, start, end, success and info are those of `SafeSwitch/CartPole-v0`, on a rail of +-1 m.
+    Dynamics and success are those of `SafeSwitch/CartPole-v0`, on a rail of +-1 m.
 
     ## Observation: `Box(64, 64, 3)`, uint8
 
     One RGB frame of a camera that stands 4.4 m in front of the rail and sees 2.2 m of it. Positions can be read from a
     frame, velocities cannot: a learner keeps a memory of its own.
+
+    ## Action: `Box(1,)`, float32
+
+    | index | quantity | unit | bounds |
+    |---|---|---|---|
+    | 0 | force on the cart | force limit (6 N) | +-1, clipped |
+
+    ## Reward
+
+    `(1 + cos(theta)) / 2 * (1 - (x / rail)^2)`, clipped to [0, 1].
+
+    ## Start, end, success
+
+    As in `SafeSwitch/CartPole-v0`: the pole hangs, the episode terminates when the cart leaves the rail, is truncated
+    after T = 80 steps of 0.06 s, and is a success if the pole was upright during the last second.
+
+    ## Info (the same keys at reset and at every step)
+
+    `state`, `parameters` (cart_mass, pole_mass, pole_length, pole_inertia, cart_damping, pole_damping, force_limit),
+    `is_success`, `disturbed`, `step` and `onset`, as in `SafeSwitch/CartPole-v0`. The expert reads them; a learner or a
+    switch rule never does.
 
     ## Arguments
 
@@ -51,6 +72,7 @@ class CartPoleImageEnv(CartPoleEnv):
     """
 
     task = "cart-pole-image"
+    camera = CAMERA
     defaults = MappingProxyType({"rail": RAIL})
 
     def __init__(
@@ -73,8 +95,6 @@ class CartPoleImageEnv(CartPoleEnv):
         if self._eye is not None:
             self._eye.close()
             self._eye = None
-
-    camera = CAMERA
 
     def _compiled(self) -> mujoco.MjModel:
         return models.cart_pole_image(self.config)
