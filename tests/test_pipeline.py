@@ -33,6 +33,7 @@ PASSIVE = {
     "safeswitch.registry",
     "safeswitch.tasks",  # chooses the rendering backend
     "safeswitch.tasks.checks",  # errors alone
+    "safeswitch.tasks.opengl",  # as rendering
     "safeswitch.tasks.rendering",  # pictures alone: an image task names it in its `modules`
     "safeswitch.tasks.visual",  # as rendering: disturbances of what a camera sees
 }
@@ -60,7 +61,7 @@ def jobs_of(store: Store, task: Task = TASK, members: tuple[Key, ...] = ()) -> d
     )
     table = stages.table_jobs(store, task, cell, "test", 2, trained)[0]
     episodes = stages.episodes_job(store, task, cell, trained, tables, give_back=False)
-    signals = stages.signals_job(store, task, cell, 0, tables)
+    signals = stages.signals_job(store, task, cell, trained, tables.test, tables.test_nominal)
     scores = pipeline.publish.scores_job(store, task, None, [episodes], [signals])  # type: ignore[arg-type]
     spread = pipeline.publish.spread_job(store, task, 0, tables)
     figures = pipeline.publish.figures_job(store, task, trained, episodes, tables, scores)

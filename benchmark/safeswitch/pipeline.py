@@ -65,7 +65,7 @@ class Run:
     @cached_property
     def demonstrations(self) -> Job:
         """The Minari dataset of the expert."""
-        job = demonstrations_job(self.store, self.task, self.profile)
+        job = demonstrations_job(self.store, self.task, self.profile, self.workers)
         self.finish("demonstrations", [job])
         return job
 

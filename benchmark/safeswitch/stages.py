@@ -74,8 +74,8 @@ def make_env(task: Task, cell: Cell, **kwargs: Any) -> TaskEnv:
     return env
 
 
-def demonstrations_job(store: Store, task: Task, profile: Profile) -> Job:
-    """Demonstrations of the expert as a Minari dataset."""
+def demonstrations_job(store: Store, task: Task, profile: Profile, workers: int = 1) -> Job:
+    """Demonstrations of the expert as a Minari dataset; one job, which spreads its episodes over workers itself."""
     settings = {**task.demonstrations, **profile.demonstrations}
     key = store.key(
         "demonstrations",
@@ -83,13 +83,13 @@ def demonstrations_job(store: Store, task: Task, profile: Profile) -> Job:
         [],
         [*PHYSICS, *task.code(), "safeswitch.demos", "safeswitch.datasets"],
     )
-    return Job("demonstrations", task.name, key, _demonstrate, (task, settings))
+    return Job("demonstrations", task.name, key, _demonstrate, (task, settings, workers))
 
 
-def _demonstrate(folder: Path, task: Task, settings: dict[str, Any]) -> None:
+def _demonstrate(folder: Path, task: Task, settings: dict[str, Any], workers: int) -> None:
     options = dict(settings)
     seeds = episode_seeds("train", options.pop("episodes"))
-    demos.collect(task.env_id, task.dataset, folder, seeds, **options)
+    demos.collect(task.env_id, task.dataset, folder, seeds, n_jobs=workers, **options)
 
 
 def learner_job(store: Store, task: Task, profile: Profile, seed: int, demonstrations: Job) -> Job:

@@ -136,7 +136,7 @@ VGG: Mapping[str, Any] = {
     "epochs": 5,
     "learning_rate": 3e-3,
 }
-"""Size and training of the image learners: many demonstrations, each seen a few times, fit better than few seen often."""
+"""Size and training of the image learners. Many demonstrations seen a few times fit better than few seen often."""
 
 
 def _cart_pole_image_cells() -> tuple[Cell, ...]:
