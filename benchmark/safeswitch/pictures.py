@@ -138,7 +138,7 @@ def _draw_signals(table: pd.DataFrame, task: Task, target: Path) -> None:
         for cell in task.cells
         if cell.tag != "none" and cell.severity == severity
     }
-    path = target / f"signals-{task.name}.png"
+    path = target / "signals.png"
     figures.figure_signals(table, task.name, titles, path, severity, drawn_signals(task))
 
 
