@@ -211,6 +211,19 @@ def test_an_episode_of_vectors_is_its_rows(data):
         np.testing.assert_array_equal(data.episode(index), data.observations[data.episodes == index])
 
 
+def test_the_first_episodes_are_a_set_of_demonstrations(data, pictures):
+    part = data.first(2)
+    end = data.steps(1).stop
+    assert len(part) == end == len(part.actions) == len(part.executed) and set(part.episodes) == {0, 1}
+    np.testing.assert_array_equal(part.observations, data.observations[:end])
+    assert len(data.first(10_000)) == len(data)
+    rollouts, root, _ = pictures
+    images = load("pictures/expert-v0", root).first(1)
+    assert len(images) == 40 and images.observations.shape == (40, 32, 32, 3)
+    np.testing.assert_array_equal(images.episode(0), rollouts[0].observations[:-1])
+    np.testing.assert_array_equal(images.executed, rollouts[0].actions)
+
+
 def test_noise_has_the_promised_size_and_correlation():
     rows = np.array([Noise(0.2, 0.2, 1.0, 0.8).draw(seed, 300, 1)[:, 0] for seed in range(100)])
     np.testing.assert_allclose(rows.std(axis=0).mean(), 0.2, rtol=0.02)

@@ -63,6 +63,10 @@ class EpisodeFrames:
             images: NDArray[np.uint8] = data[f"episode_{index}"]["observations"][: self.lengths[index]]
         return images
 
+    def first(self, count: int) -> EpisodeFrames:
+        """The images of the first `count` episodes."""
+        return EpisodeFrames(self.file, self.lengths[:count])
+
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         """All images in memory, for those who ask NumPy for them."""
         images = np.concatenate([self.episode(index) for index in range(len(self.lengths))])

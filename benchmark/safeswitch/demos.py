@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -122,6 +122,18 @@ class Demonstrations:
         if isinstance(self.observations, EpisodeFrames):
             return self.observations.episode(episode)
         return self.observations[self.steps(episode)]
+
+    def first(self, count: int) -> Demonstrations:
+        """The first `count` episodes; all of them if there are no more."""
+        end = int(np.searchsorted(self.episodes, count))
+        images = self.observations
+        return replace(
+            self,
+            observations=images.first(count) if isinstance(images, EpisodeFrames) else images[:end],
+            actions=self.actions[:end],
+            episodes=self.episodes[:end],
+            executed=None if self.executed is None else self.executed[:end],
+        )
 
 
 def collect(

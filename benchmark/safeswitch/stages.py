@@ -32,6 +32,9 @@ if TYPE_CHECKING:
     from safeswitch.protocols import Method
     from safeswitch.tasks.base import TaskEnv
 
+FIT_EPISODES = 250
+"""Demonstrations to whose features signals are fitted: 20,000 steps, many times the number of features."""
+
 CHUNK = 20
 """Episodes per table job: small enough to resume from and to spread over workers."""
 
@@ -113,7 +116,7 @@ def fits_job(store: Store, task: Task, seed: int, learner: Job, demonstrations: 
     code = {source_of("learner", task.learner), *(source_of("signal", name) for name in names)}
     key = store.key(
         "signal-fits",
-        {"signals": list(names), "seed": seed},
+        {"signals": list(names), "seed": seed, "episodes": FIT_EPISODES},
         [learner.key, demonstrations.key],
         ["safeswitch.protocols", "safeswitch.seeding", *sorted(code)],
     )
@@ -122,7 +125,8 @@ def fits_job(store: Store, task: Task, seed: int, learner: Job, demonstrations: 
 
 
 def _fit_signals(folder: Path, task: Task, names: tuple[str, ...], seed: int, learner: str, dataset_root: str) -> None:
-    training = TrainingFeatures(load_learner(task, learner), demos.load(task.dataset, Path(dataset_root)))
+    demonstrations = demos.load(task.dataset, Path(dataset_root)).first(FIT_EPISODES)
+    training = TrainingFeatures(load_learner(task, learner), demonstrations)
     for name in names:
         save_arrays(folder / f"{name}.npz", **registry.find("signal", name).fit(training, seed))
 
