@@ -76,10 +76,14 @@ class Object(Visual):
         kinds = list(self.KINDS)
         self._props = self.KINDS[kinds[int(rng.integers(len(kinds)))]]
         self._size = self.value * rng.uniform(self.SMALLEST, 1.0)
-        hue = GREEN + self.HUES[self.severity - 1] * rng.uniform(-0.5, 0.5)
-        self._colour = colorsys.hsv_to_rgb(hue % 1.0, rng.uniform(0.6, 1.0), rng.uniform(0.4, 1.0))
+        self._colour = self._draw_colour(rng)
         self._turn = rng.uniform(-math.pi / 2, math.pi / 2)
         self._place = self._draw_place(rng, horizon)
+
+    def _draw_colour(self, rng: np.random.Generator) -> tuple[float, float, float]:
+        """Red, green and blue."""
+        hue = GREEN + self.HUES[self.severity - 1] * rng.uniform(-0.5, 0.5)
+        return colorsys.hsv_to_rgb(hue % 1.0, rng.uniform(0.6, 1.0), rng.uniform(0.4, 1.0))
 
     def _draw_place(self, rng: np.random.Generator, horizon: int) -> NDArray[np.float64]:
         """(3,) [m]: somewhere about the rail."""
@@ -134,16 +138,19 @@ class ObjectPassing(Object):
 
 @offer
 class ObjectFar(Object):
-    """An object in an upper corner of the picture. Benign: new, but far from everything that matters."""
+    """A pale object in an upper corner of the picture. Benign: new, but far from everything that matters."""
 
     name = "object-far"
     benign = True
-    levels = (0.03, 0.04, 0.05, 0.06, 0.07)
-    sentence = "an object of up to {:g} m in radius appears in an upper corner"
+    levels = (0.02, 0.03, 0.04, 0.05, 0.06)
+    sentence = "a pale object of up to {:g} m in radius appears in an upper corner"
 
     def _draw_place(self, rng: np.random.Generator, horizon: int) -> NDArray[np.float64]:
         side = rng.choice((-1.0, 1.0))
         return np.array([side * rng.uniform(0.85, 1.05), BEHIND, HINGE_HEIGHT + rng.uniform(0.85, 1.05)])
+
+    def _draw_colour(self, rng: np.random.Generator) -> tuple[float, float, float]:
+        return colorsys.hsv_to_rgb(rng.random(), rng.uniform(0.05, 0.2), rng.uniform(0.75, 0.9))
 
 
 @offer
