@@ -122,6 +122,12 @@ def scale_mass(nominal: mujoco.MjModel, model: mujoco.MjModel, body: str, factor
     model.body_inertia[index] = factor * nominal.body_inertia[index]
 
 
+def repaint(nominal: mujoco.MjModel, model: mujoco.MjModel, material: str, colour: Array, share: float) -> None:
+    """Mix the colour of a material with a `share` of `colour` (red, green, blue)."""
+    index = nominal.material(material).id
+    model.mat_rgba[index, :3] = (1.0 - share) * nominal.mat_rgba[index, :3] + share * colour
+
+
 # ---------------------------------------------------------------------------------------------------------- dynamics
 
 
@@ -293,6 +299,4 @@ class Repaint(Disturbance):
     def alter(self, nominal: mujoco.MjModel, model: mujoco.MjModel) -> None:
         """Mix the colours."""
         for name, colour in zip(("cart", "pole", "bob"), self._palette, strict=True):
-            material = nominal.material(name).id
-            before = nominal.mat_rgba[material, :3]
-            model.mat_rgba[material, :3] = (1.0 - self.value) * before + self.value * np.array(colour)
+            repaint(nominal, model, name, np.array(colour), self.value)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from safeswitch.tasks import disturbances
-from safeswitch.tasks.disturbances import offer
+from safeswitch.tasks.disturbances import offer, repaint
 
 IMAGES = frozenset({"cart-pole-image"})
 
@@ -208,9 +208,7 @@ class Background(Visual):
     def alter(self, nominal: mujoco.MjModel, model: mujoco.MjModel) -> None:
         """Mix the colours."""
         for name in self.MATERIALS:
-            material = nominal.material(name).id
-            before = nominal.mat_rgba[material, :3]
-            model.mat_rgba[material, :3] = (1.0 - self.value) * before + self.value * self._colour
+            repaint(nominal, model, name, self._colour, self.value)
 
 
 @offer
