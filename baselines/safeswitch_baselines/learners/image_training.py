@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import cycle
 
 import numpy as np
 import torch
@@ -160,7 +162,7 @@ def fit(
 ) -> History:
     """Train `model` in place on the episodes `training`; `held_out` are for validation and may be empty."""
     place = next(model.parameters()).device
-    encoder = Encoder(encoding, config.frames, max(config.batch_size, EVALUATION_BATCH), place)
+    encoders = [Encoder(encoding, config.frames, max(config.batch_size, EVALUATION_BATCH), place) for _ in range(2)]
     layout = config.layout(*encoding.observation_shape[:2])
     bits = np.random.PCG64DXSM(seed_sequence(seed, "training-masks"))
     optimiser = make_optimiser(model, config)
@@ -173,18 +175,18 @@ def fit(
         for epoch, batches in enumerate(epochs_of(demos, training, seed, config)):
             warm_up = epoch < config.warmup_epochs
             total = torch.zeros((), device=place)
-            for pool, rows in batches:
+            for pool, rows, stacks in encoded_ahead(batches, encoders):
                 rate = learning_rate(config, seen, config.epochs * n)
                 masks = scaled_masks(layout.draw(bits, len(rows)), config.rates, place)
                 labels = pool.labels[rows].to(place)
-                loss = batch_loss(model, encoder(pool, rows), labels, masks, config, warm_up)
+                loss = batch_loss(model, stacks, labels, masks, config, warm_up)
                 descend(model, optimiser, loss, rate, config.max_gradient_norm)
                 total += loss.detach() * len(rows)
                 seen += len(rows)
             history["loss"].append(total.item() / n)
             history["learning_rate"].append(rate)
             if validation is not None:
-                nll, rmse = evaluate(model, encoder, validation)
+                nll, rmse = evaluate(model, encoders[0], validation)
                 history.setdefault("validation_nll", []).append(nll)
                 history.setdefault("validation_rmse", []).append(rmse)
             report(epoch + 1, config.epochs)
@@ -213,6 +215,27 @@ def _batches(
         rows = torch.from_numpy(rng.permutation(len(pool)))
         for first in range(0, len(rows), config.batch_size):
             yield pool, rows[first : first + config.batch_size]
+
+
+def encoded_ahead(
+    batches: Iterator[tuple[Pool, Tensor]], encoders: Sequence[Encoder]
+) -> Iterator[tuple[Pool, Tensor, Tensor]]:
+    """The batches with their encoded stacks, the next one of which a second thread prepares meanwhile.
+
+    That is a fifth of the work of training, and where another core is idle it costs no time. The bits are the same.
+    """
+
+    def encode(batch: tuple[Pool, Tensor], encoder: Encoder) -> tuple[Pool, Tensor, Tensor]:
+        return *batch, encoder(*batch)
+
+    with ThreadPoolExecutor(1, initializer=torch.set_num_threads, initargs=(1,)) as executor:
+        ahead = None
+        for batch, encoder in zip(batches, cycle(encoders), strict=False):
+            ready, ahead = ahead, executor.submit(encode, batch, encoder)
+            if ready is not None:
+                yield ready.result()
+        if ahead is not None:
+            yield ahead.result()
 
 
 def evaluate(model: DropoutVGG, encoder: Encoder, pool: Pool) -> tuple[float, float]:
