@@ -96,3 +96,18 @@ def test_tables_that_hold_no_undisturbed_states_are_refused() -> None:
         shown_traces(env, Brightness(), [Seen()], recorded().take(np.array([0])))
     with pytest.raises(ValueError, match="disturbed ones"):
         shown_traces(env, Brightness(), [Seen()], recorded("object"))
+
+
+def test_outcomes_up_to_the_onset_are_those_of_the_undisturbed_twin() -> None:
+    twin = recorded().complete()
+    own, shared = recorded("object").complete(), recorded("object").share(twin)
+    steps = np.arange(own.horizon + 1)
+    before = (steps <= own.onset[:, None]) & (steps < own.length[:, None])
+    np.testing.assert_array_equal(shared.known() != -1, before | (steps >= own.length[:, None]))
+    np.testing.assert_array_equal(shared.known()[before], own.known()[before])
+    np.testing.assert_array_equal(shared.complete().known(), own.known())
+
+
+def test_outcomes_are_not_shared_with_another_table() -> None:
+    with pytest.raises(ValueError, match="undisturbed twin"):
+        recorded("object").share(recorded("object"))

@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import product
 
 from joblib import Parallel, delayed, parallel_config
 
@@ -121,16 +122,22 @@ class Run:
         return TaskInfo(horizon=env.horizon, control_dt=env.control_dt)
 
     def _tables(self, cells: tuple[Cell, ...]) -> dict[tuple[int, str], CellTables]:
-        counts: dict[Split, int] = {"calibrate": self.profile.calibrate, "test": self.profile.test}
-        chunks = {
-            (trained.seed, cell, split): table_jobs(self.store, self.task, cell, split, count, trained)
-            for trained in self.trained
-            for cell in cells
-            for split, count in counts.items()
-        }
-        self.finish("handover tables", [job for jobs in chunks.values() for job in jobs])
-        keys = {name: tuple(job.key for job in jobs) for name, jobs in chunks.items()}
         none = self.task.none_cell
+        calibrated_on = {none, *(self.task.calibrated_on(cell) for cell in cells)}
+        chunks: dict[tuple[int, Cell, Split], list[Job]] = {}
+        for group in ((none,), tuple(cell for cell in cells if cell != none)):  # the others share outcomes of `none`
+            stage = []
+            for trained, cell in product(self.trained, group):
+                counts: dict[Split, int] = {"test": self.profile.test}
+                if cell in calibrated_on:
+                    counts["calibrate"] = self.profile.calibrate
+                for split, count in counts.items():
+                    twins = chunks.get((trained.seed, none, split), ())
+                    jobs = table_jobs(self.store, self.task, cell, split, count, trained, twins)
+                    chunks[trained.seed, cell, split] = jobs
+                    stage += jobs
+            self.finish("handover tables", stage)
+        keys = {name: tuple(job.key for job in jobs) for name, jobs in chunks.items()}
         return {
             (seed, str(cell)): CellTables(
                 keys[seed, self.task.calibrated_on(cell), "calibrate"],

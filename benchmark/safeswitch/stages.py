@@ -7,7 +7,7 @@ pure function of its arguments, so the bits do not depend on the number of worke
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,6 +37,9 @@ FIT_EPISODES = 250
 
 CHUNK = 20
 """Episodes per table job: small enough to resume from and to spread over workers."""
+
+SHOWN_CHUNKS = 2
+"""Chunks of undisturbed episodes (3,200 states) on which a disturbance that is only seen is shown to the signals."""
 
 PHYSICS = (
     "safeswitch.seeding",
@@ -136,16 +139,27 @@ def signal_code(task: Task) -> list[str]:
     return sorted({source_of("signal", name) for name in ("smoothed", *base_signals(task.signals))})
 
 
-def table_jobs(store: Store, task: Task, cell: Cell, split: Split, count: int, trained: Trained) -> list[Job]:
+def table_jobs(
+    store: Store,
+    task: Task,
+    cell: Cell,
+    split: Split,
+    count: int,
+    trained: Trained,
+    twins: Sequence[Job] = (),
+) -> list[Job]:
     """The handover table of one (cell, learner) on the first `count` seeds of a split, in chunks of episodes.
 
     Outcomes are computed here for the cells whose tables are used again and again (`Cell.complete`); elsewhere they
-    are computed when a rule first asks for them.
+    are computed when a rule first asks for them. Where the disturbance is only seen, those up to the onset are taken
+    from `twins`, finished jobs of the undisturbed cell.
     """
+    twins = twins if only_seen(cell) else ()
     code = [*PHYSICS, *task.code(), *HANDOVER, source_of("learner", task.learner), *signal_code(task)]
     jobs = []
-    for first in range(0, count, CHUNK):
+    for index, first in enumerate(range(0, count, CHUNK)):
         size = min(CHUNK, count - first)
+        twin = [twins[index].key] if twins else []
         settings = {
             "env": task.env_id,
             "cell": cell.env_kwargs,
@@ -154,17 +168,28 @@ def table_jobs(store: Store, task: Task, cell: Cell, split: Split, count: int, t
             "signals": list(task.signals),
             "complete": cell.complete,
         }
-        key = store.key("table", settings, trained.keys, code)
+        key = store.key("table", settings, [*trained.keys, *twin], code)
         label = f"{cell} {split} {first}-{first + size - 1} (learner {trained.seed})"
-        arguments = (task, cell, split, first, size, trained)
+        arguments = (task, cell, split, first, size, trained, [str(store.folder(key)) for key in twin])
         jobs.append(Job("table", label, key, _tabulate, arguments))
     return jobs
 
 
-def _tabulate(folder: Path, task: Task, cell: Cell, split: Split, first: int, count: int, trained: Trained) -> None:
+def _tabulate(
+    folder: Path,
+    task: Task,
+    cell: Cell,
+    split: Split,
+    first: int,
+    count: int,
+    trained: Trained,
+    twins: Sequence[str],
+) -> None:
     env = make_env(task, cell)
     seeds = episode_seeds(split, count, first)
     table = record_table(env, trained.learner(task), trained.signals(task), env.make_expert(), seeds)
+    for twin in twins:
+        table.share(HandoverTable.load(Path(twin) / "table.npz"))
     if cell.complete:
         table.complete()
     table.save(folder / "table.npz")
@@ -338,10 +363,11 @@ def _score_signals(
             by_signal[signal] = signal_quality(disturbed.signals[signal], twins.signals[signal], *about)
     if only_seen(cell):
         env = make_env(task, cell)
-        shown, visible = shown_traces(env, trained.learner(task), trained.signals(task), twins)
+        states = load_table(store, task, task.none_cell, twin_keys[:SHOWN_CHUNKS])
+        shown, visible = shown_traces(env, trained.learner(task), trained.signals(task), states)
         env.close()
         for signal in task.signals:
-            frames = frame_quality(shown[signal], twins.signals[signal], visible)
+            frames = frame_quality(shown[signal], states.signals[signal], visible)
             before = by_signal.get(signal, frames)
             by_signal[signal] = replace(frames, episode_auroc=before.episode_auroc)
     rows = [{"signal": signal, **asdict(quality)} for signal, quality in by_signal.items()]

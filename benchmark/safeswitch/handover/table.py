@@ -141,6 +141,19 @@ class HandoverTable:
         self.sources[0].resolve = Continuation(env, expert, self.seeds, self.snapshots)
         return self
 
+    def share(self, twin: HandoverTable) -> HandoverTable:
+        """Take over the outcomes up to the onset that the undisturbed `twin` of the same seeds and learner knows.
+
+        Up to there both are one trajectory. For a disturbance that is only seen the expert's continuation is the same
+        too, to the last bit; for any other this would be wrong.
+        """
+        if not np.array_equal(self.seeds, twin.seeds) or twin.disturbed.any() or len(self.sources) != 1:
+            raise ValueError("outcomes are shared with the undisturbed twin of a table as it was recorded: same seeds")
+        known, steps = twin.known(), np.arange(self.horizon + 1)
+        shared = (steps <= self.onset[:, None]) & (steps < self.length[:, None]) & (known != UNKNOWN)
+        self.sources[0].known[shared] = known[shared]
+        return self
+
     def save(self, path: Path, snapshots: bool = True) -> None:
         """Write as .npz without pickle; without snapshots it holds only the outcomes that are known by now."""
         save_arrays_compressed(
