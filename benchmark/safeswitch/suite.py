@@ -133,8 +133,9 @@ VGG: Mapping[str, Any] = {
     "channels": (16, 32, 64),
     "strides": (2, 1, 1),
     "pools": 2,
-    "epochs": 5,
-    "learning_rate": 3e-3,
+    "epochs": 6,
+    "batch_size": 32,
+    "learning_rate": 2e-3,
     "pool_episodes": 1000,
 }
 """Size and training of the image learners. Many demonstrations seen a few times fit better than few seen often, and
@@ -174,7 +175,7 @@ TASKS: dict[str, Task] = {
         name="cart-pole-image",
         env_id="SafeSwitch/CartPoleImage-v0",
         learner="dropout-vgg",
-        learner_options={**VGG, "pixel_floor": 0.05, "warmup_epochs": 1},
+        learner_options={**VGG, "hidden_dropout": (0.3, 0.1), "warmup_epochs": 1},
         demonstrations={
             "episodes": 1000,
             "noise": {"low": 0.23, "high": 0.23, "correlated_fraction": 1.0, "correlation": 0.5},

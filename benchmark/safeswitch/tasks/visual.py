@@ -63,7 +63,7 @@ class Object(Visual):
 
     name = "object"
     kind = "appearance"
-    levels = (0.06, 0.12, 0.18, 0.24, 0.30)
+    levels = (0.08, 0.16, 0.24, 0.31, 0.38)
     sentence = "an object of up to {:g} m in radius appears in the picture"
     KINDS: ClassVar[dict[str, Sizes]] = KINDS
     HUES: ClassVar[tuple[float, ...]] = (0.1, 0.2, 0.35, 0.65, 1.0)
