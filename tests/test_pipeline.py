@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from micro import MICRO, TASK, leaderboard_bytes, micro_run
-from safeswitch import pipeline, stages
+from safeswitch import pipeline, scoring_stages, stages
 from safeswitch.handover.episode import NeverSwitch, run_episode
 from safeswitch.pipeline import Run
 from safeswitch.stages import CellTables, Job
@@ -60,8 +60,8 @@ def jobs_of(store: Store, task: Task = TASK, members: tuple[Key, ...] = ()) -> d
         keys[cell, "calibrate"], keys[task.none_cell, "calibrate"], keys[cell, "test"], keys[task.none_cell, "test"]
     )
     table = stages.table_jobs(store, task, cell, "test", 2, trained)[0]
-    episodes = stages.episodes_job(store, task, cell, trained, tables, give_back=False)
-    signals = stages.signals_job(store, task, cell, trained, tables.test, tables.test_nominal)
+    episodes = scoring_stages.episodes_job(store, task, cell, trained, tables, give_back=False)
+    signals = scoring_stages.signals_job(store, task, cell, trained, tables.test, tables.test_nominal)
     scores = pipeline.publish.scores_job(store, task, None, [episodes], [signals])  # type: ignore[arg-type]
     spread = pipeline.publish.spread_job(store, task, 0, tables)
     figures = pipeline.publish.figures_job(store, task, trained, episodes, tables, scores)

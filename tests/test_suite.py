@@ -5,7 +5,7 @@ from __future__ import annotations
 import gymnasium as gym
 import pytest
 
-from safeswitch import evaluate, registry, stages, suite
+from safeswitch import evaluate, registry, scoring_stages, stages, suite
 from safeswitch.suite import SPLIT_SIZE, SPLITS, Cell, Task, episode_seeds
 from safeswitch.tasks.disturbances import SEVERITIES, offered
 
@@ -75,7 +75,7 @@ def test_thresholds_come_from_a_cell_in_which_something_can_be_saved(cell: Cell)
     task = suite.task(cell.task)
     expected = task.paper_cell if cell.tag in ("none", "benign", "held-out") else cell
     assert task.calibrated_on(cell) == expected
-    assert stages.protocols_of(cell) == (("start",) if cell.tag == "none" else ("onset", "start"))
+    assert scoring_stages.protocols_of(cell) == (("start",) if cell.tag == "none" else ("onset", "start"))
 
 
 @pytest.mark.parametrize("profile", suite.PROFILES.values(), ids=lambda profile: profile.name)

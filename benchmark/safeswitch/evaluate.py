@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from joblib import Parallel, delayed, parallel_config
 
-from safeswitch import registry, stages, suite
+from safeswitch import registry, scoring_stages, stages, suite
 from safeswitch.handover.episode import Episode, NeverSwitch, continue_with_expert, run_episode
 from safeswitch.names import unknown
 from safeswitch.protocols import ARMINGS, Arming
@@ -36,7 +36,7 @@ def evaluate(run: Run, method_id: str, disturbance: str, severity: int, protocol
     """The leaderboard's row of one latched method in one cell, on the profile's learners and episodes."""
     arming = _checked_arming(protocol)
     cell = find_cell(run.task, disturbance, severity)
-    if arming not in stages.protocols_of(cell):
+    if arming not in scoring_stages.protocols_of(cell):
         raise ValueError(f"cell {cell} has no onset: score it with --protocol start")
     method = registry.make_method(method_id)
     if not method.latched:
@@ -46,12 +46,12 @@ def evaluate(run: Run, method_id: str, disturbance: str, severity: int, protocol
     frames = []
     for seed in range(len(run.learners)):
         loaded = run.tables_of(seed, cell).load(run.store, run.task, cell)
-        test = stages.test_panel(loaded, cell, arming)
-        calibration = stages.calibration_of(loaded, run.task, cell, arming, seed)
+        test = scoring_stages.test_panel(loaded, cell, arming)
+        calibration = scoring_stages.calibration_of(loaded, run.task, cell, arming, seed)
         for name in names:
             calibrated = registry.make_method(name).calibrate(calibration)
             rows = latched_rows(test, calibrated)
-            frames.append(stages.labelled(rows, cell, arming, name, seed, calibrated, ""))
+            frames.append(scoring_stages.labelled(rows, cell, arming, name, seed, calibrated, ""))
     table = leaderboard(stages.concat(frames), {run.task.name: run.task_info})
     return dict(table[table["method"] == method_id].iloc[0])
 
@@ -76,7 +76,7 @@ def play(run: Run, driver: str, disturbance: str, severity: int, protocol: str, 
     if driver != "learner":
         on = run.task.calibrated_on(cell) if driver != "expert" else run.task.paper_cell
         loaded = run.tables_of(0, on).load(run.store, run.task, on)
-        calibration = stages.calibration_of(loaded, run.task, on, arming, 0)
+        calibration = scoring_stages.calibration_of(loaded, run.task, on, arming, 0)
         rule = registry.make_method(driver).calibrate(calibration).rule
         if not hasattr(rule, "update"):
             raise ValueError(f"{driver} needs hindsight and cannot drive an episode")

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from safeswitch import registry, stages
+from safeswitch import registry, scoring_stages, stages
 from safeswitch.files import load_arrays, load_frame
 from safeswitch.handover.episode import Episode, NeverSwitch, run_episode
 from safeswitch.handover.panel import PHI, Calibration, Panel
@@ -56,15 +56,15 @@ def draw(folder: Path, root: str, task: Task, trained: Trained, episodes: str, t
     rows = load_frame(store.folder(episodes) / "episodes.npz")
     logs = load_arrays(store.folder(episodes) / "logs.npz")
     table = read_csv(store.folder(scores) / "leaderboard.csv")
-    for protocol in stages.protocols_of(cell):
-        calibration = stages.calibration_of(loaded, task, cell, protocol, seed=0)
+    for protocol in scoring_stages.protocols_of(cell):
+        calibration = scoring_stages.calibration_of(loaded, task, cell, protocol, seed=0)
         for signal in drawn_signals(task):
             _draw_cem(calibration.panel, rows, logs, protocol, cell, signal, target)
-        _draw_sweep(stages.test_panel(loaded, cell, protocol), rows, protocol, task, target)
+        _draw_sweep(scoring_stages.test_panel(loaded, cell, protocol), rows, protocol, task, target)
         place = (cell.disturbance, cell.severity)
         figures.figure_plane(table, task.name, place, protocol, target / f"plane-{protocol}.png")
     _draw_signals(read_csv(store.folder(scores) / "signals.csv"), task, target)
-    calibration = stages.calibration_of(loaded, task, cell, "onset", seed=0)
+    calibration = scoring_stages.calibration_of(loaded, task, cell, "onset", seed=0)
     story = _drive_story(task, trained, loaded["test"], calibration, rows)
     _draw_episode(story, rows, target)
     _draw_film(story, target)

@@ -1,8 +1,8 @@
 """READ FIRST: expert -> demonstrations -> learner -> signals -> handover tables -> switch rules -> leaderboard.
 
-A `Run` holds the stages of one task in this order; `stages.py` says what each computes, `suite.py` what is run, and
-`publish.py` writes the tables. Finished work is kept in a store by the hash of everything it depends on, so that a
-second run computes nothing and an interrupted one continues where it stopped.
+A `Run` holds the stages of one task in this order; `stages.py` and `scoring_stages.py` say what each computes,
+`suite.py` what is run, and `publish.py` writes the tables. Finished work is kept in a store by the hash of everything
+it depends on, so that a second run computes nothing and an interrupted one continues where it stopped.
 """
 
 from __future__ import annotations
@@ -18,17 +18,16 @@ from joblib import Parallel, delayed, parallel_config
 from safeswitch import publish
 from safeswitch.console import Progress
 from safeswitch.scoring.metrics import TaskInfo
+from safeswitch.scoring_stages import episodes_job, signals_job
 from safeswitch.stages import (
     CHUNK,
     CellTables,
     Job,
     demonstrations_job,
-    episodes_job,
     fits_job,
     learner_job,
     make_env,
     only_seen,
-    signals_job,
     table_jobs,
 )
 from safeswitch.store import Store

@@ -23,7 +23,8 @@ from safeswitch.scoring.leaderboard import leaderboard, merge_task_rows, read_cs
 from safeswitch.scoring.markdown import write_markdown
 from safeswitch.scoring.metrics import TaskInfo
 from safeswitch.scoring.signal_quality import signal_table
-from safeswitch.stages import Job, calibration_of, load_rows, protocols_of, source_of
+from safeswitch.scoring_stages import calibration_of, protocols_of
+from safeswitch.stages import Job, load_rows, source_of
 from safeswitch.store import Store
 from safeswitch.suite import SPLIT_SIZE, SPLITS, TASKS, Cell, Task, methods
 
