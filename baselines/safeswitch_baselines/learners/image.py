@@ -7,8 +7,7 @@ of (episode seed, step) alone, as the masks of all learners are (`dropout.MaskSt
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,16 +15,14 @@ import torch
 from numpy.typing import NDArray
 
 from safeswitch.protocols import Prediction
-from safeswitch_baselines.learners import storage
 from safeswitch_baselines.learners.dropout import FrozenLayers, MaskStream, one_thread, scaled_masks
 from safeswitch_baselines.learners.gaussian import moments
+from safeswitch_baselines.learners.trained import TrainedLearner
 from safeswitch_baselines.learners.vgg import DropoutVGG, PixelEncoding, VGGConfig
 
 if TYPE_CHECKING:
     from safeswitch.demos import Demonstrations
     from safeswitch_baselines.learners.descent import Progress
-
-FORMAT = "safeswitch-dropout-vgg-1"
 
 
 class FrameStack:
@@ -66,28 +63,10 @@ class FrameStack:
         return self._tensor
 
 
-class DropoutVGGLearner:
-    """DropoutVGG as a `safeswitch.protocols.Learner`.
+class DropoutVGGLearner(TrainedLearner[DropoutVGG, PixelEncoding, VGGConfig]):
+    """DropoutVGG as a `safeswitch.protocols.Learner`; see `TrainedLearner` for its arguments."""
 
-    Args:
-        model: the trained network (it is moved to the CPU: one decision is too small for a GPU).
-        encoding: frame to network input.
-        config: what it was trained with; `config.samples` is K.
-        history: one number per epoch and curve, as `image_training` recorded it.
-    """
-
-    def __init__(
-        self,
-        model: DropoutVGG,
-        encoding: PixelEncoding,
-        config: VGGConfig,
-        history: Mapping[str, Sequence[float]] | None = None,
-    ) -> None:
-        self.model = model.cpu().eval()
-        self.encoding = encoding
-        self.config = config
-        self.history = {key: list(values) for key, values in (history or {}).items()}
-        self._prepare()
+    FORMAT = "safeswitch-dropout-vgg-1"
 
     def _prepare(self) -> None:
         """Build what `predict` needs from the model."""
@@ -96,11 +75,6 @@ class DropoutVGGLearner:
         self._stack = FrameStack(self.encoding, config.frames)
         self._head = FrozenLayers(self.model.linears(), config.head_rates, config.samples, config.shared_trunk)
         self._masks = MaskStream(config.layout(height, width), config.samples)
-
-    @property
-    def observation_shape(self) -> tuple[int, ...]:
-        """Shape of the observations it was trained on."""
-        return self.encoding.observation_shape
 
     def reset(self, seed: int) -> None:
         """Start an episode: forget the frames and key the dropout masks by its seed."""
@@ -171,42 +145,15 @@ class DropoutVGGLearner:
         """The configuration that `options` ask for."""
         return VGGConfig.from_json(options)
 
-    def save(self, folder: Path | str) -> Path:
-        """Write weights (safetensors), config and history (JSON) into `folder`, whole or not at all."""
-        tensors = {f"network.{key}": value for key, value in self.model.state_dict().items()}
-        tensors["encoding.scale"] = torch.from_numpy(self.encoding.scale)
-        tensors["encoding.offset"] = torch.from_numpy(self.encoding.offset)
-        if self.encoding.change is not None:
-            tensors["encoding.change"] = torch.from_numpy(self.encoding.change)
-        description = {
-            "observation_shape": self.encoding.observation_shape,
-            "actions": self.model.actions,
-            "config": self.config.to_json(),
-            "history": self.history,
-        }
-        return storage.write(folder, FORMAT, tensors, description)
-
     @classmethod
-    def load(cls, folder: Path | str) -> DropoutVGGLearner:
-        """Learner saved by `save`; it predicts the same bits on the same machine."""
-        tensors, description = storage.read(folder, FORMAT)
-        config = VGGConfig.from_json(description["config"])
-        parts = {name.removeprefix("encoding."): tensors.pop(name) for name in list(tensors) if "encoding." in name}
-        encoding = PixelEncoding(**{name: value.numpy().copy() for name, value in parts.items()})
-        state = {key.removeprefix("network."): value for key, value in tensors.items()}
-        return cls(_network_of(state, encoding, config), encoding, config, description["history"])
+    def _parts(
+        cls, description: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
+    ) -> tuple[PixelEncoding, VGGConfig]:
+        return PixelEncoding(**arrays), VGGConfig.from_json(description["config"])
 
-    def __getstate__(self) -> dict[str, Any]:
-        """What a copy in another process is rebuilt from; the frames seen so far stay behind."""
-        weights = {key: value.numpy() for key, value in self.model.state_dict().items()}
-        return {"weights": weights, "encoding": self.encoding, "config": self.config, "history": self.history}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Rebuild the network in this process's own aligned memory."""
-        self.encoding, self.config, self.history = state["encoding"], state["config"], state["history"]
-        weights = {key: torch.tensor(value) for key, value in state["weights"].items()}
-        self.model = _network_of(weights, self.encoding, self.config).eval()
-        self._prepare()
+    @staticmethod
+    def _build(encoding: PixelEncoding, config: VGGConfig, actions: int, generator: torch.Generator) -> DropoutVGG:
+        return DropoutVGG(encoding.observation_shape, actions, config, generator)
 
 
 class PaperLiteralLearner(DropoutVGGLearner):
@@ -228,12 +175,3 @@ PAPER_LITERAL: Mapping[str, Any] = {
     "hidden_dropout": 0.1,
 }
 """What sets `PaperLiteralLearner` apart; everything else is as in `VGGConfig`."""
-
-
-def _network_of(state: Mapping[str, torch.Tensor], encoding: PixelEncoding, config: VGGConfig) -> DropoutVGG:
-    """Network with the given weights."""
-    # The generator only keeps the initial weights, replaced at once, from touching torch's global one.
-    generator = torch.Generator().manual_seed(0)
-    model = DropoutVGG(encoding.observation_shape, len(state["output.bias"]) // 2, config, generator)
-    model.load_state_dict(dict(state))
-    return model

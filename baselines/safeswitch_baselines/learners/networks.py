@@ -96,6 +96,10 @@ class InputEncoding:
         """Number of network inputs, e."""
         return len(self.mean)
 
+    def arrays(self) -> dict[str, NDArray[np.float64]]:
+        """Mean and scale."""
+        return {"mean": self.mean, "scale": self.scale}
+
     def __call__(self, observations: NDArray[Any]) -> NDArray[np.float64]:
         """Encode observations (n, d) as (n, e), float64: other components in their order, then sines, then cosines."""
         raw = np.asarray(observations, dtype=np.float64)

@@ -185,6 +185,11 @@ class PixelEncoding:
         """Shape of a frame, (H, W, C)."""
         return self.scale.shape
 
+    def arrays(self) -> dict[str, NDArray[np.float32]]:
+        """Scale and offset, and change where it is used."""
+        parts = {"scale": self.scale, "offset": self.offset, "change": self.change}
+        return {name: value for name, value in parts.items() if value is not None}
+
     def factors(self, frames: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Scale and offset (H, W, F C) of a whole stack, oldest first, after differences were taken."""
         if self.change is None:

@@ -1,0 +1,180 @@
+"""The stages that score: methods on the test episodes of a cell, and signals on its frames and episodes.
+
+As in `safeswitch.stages`, each is a job that is a pure function of its arguments.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+
+from safeswitch import registry
+from safeswitch.files import save_arrays, save_frame
+from safeswitch.handover.episode import run_episode
+from safeswitch.handover.panel import Calibration, Panel
+from safeswitch.handover.shown import shown_traces
+from safeswitch.handover.table import HandoverTable, concatenate
+from safeswitch.protocols import ARMINGS, Arming
+from safeswitch.scoring.rows import episode_rows, latched_rows
+from safeswitch.scoring.signal_quality import SignalQuality, frame_quality, signal_quality
+from safeswitch.stages import CellTables, Job, concat, load_table, make_env, only_seen, source_of
+from safeswitch.store import Store
+from safeswitch.suite import Cell, Task, methods
+from safeswitch.trained import Trained
+
+if TYPE_CHECKING:
+    from safeswitch.protocols import Method
+
+SHOWN_CHUNKS = 2
+"""Chunks of undisturbed episodes (3,200 states) on which a disturbance that is only seen is shown to the signals."""
+
+
+def episodes_job(store: Store, task: Task, cell: Cell, trained: Trained, tables: CellTables, give_back: bool) -> Job:
+    """Calibrate every method and score it on the test episodes of one (learner, cell), under both armings."""
+    ids = methods(task.signals)
+    settings = {"cell": str(cell), "learner_seed": trained.seed, "methods": list(ids), "give_back": give_back}
+    keys = [*tables.calibrate, *tables.calibrate_nominal, *tables.test, *tables.test_nominal]
+    rules = {source_of("method", name.partition("@")[0]) for name in ids}
+    code = ["safeswitch.handover.panel", "safeswitch.scoring.rows", *sorted(rules)]
+    key = store.key("episodes", settings, [*trained.keys, *keys], code)
+    arguments = (str(store.root), task, cell, trained, tables, give_back)
+    return Job("episodes", f"{cell} learner {trained.seed}", key, _score_episodes, arguments)
+
+
+def _score_episodes(
+    folder: Path,
+    root: str,
+    task: Task,
+    cell: Cell,
+    trained: Trained,
+    tables: CellTables,
+    give_back: bool,
+) -> None:
+    loaded = tables.load(Store(Path(root)), task, cell)
+    frames, logs = [], {}
+    for protocol in protocols_of(cell):
+        test = test_panel(loaded, cell, protocol)
+        calibration = calibration_of(loaded, task, cell, protocol, trained.seed)
+        for method_id in methods(task.signals):
+            method: Method = registry.make_method(method_id)
+            if not method.latched and not give_back:
+                continue
+            calibrated = method.calibrate(calibration)
+            if method.latched:
+                rows = latched_rows(test, calibrated)
+            else:
+                rows = _plain_rows(task, cell, trained, test, calibrated.rule)
+            on = "" if task.calibrated_on(cell) == cell else str(task.calibrated_on(cell))
+            frames.append(labelled(rows, cell, protocol, method_id, trained.seed, calibrated, on))
+            logs.update({f"{protocol}|{method_id}|{name}": value for name, value in calibrated.log.items()})
+    save_frame(folder / "episodes.npz", concat(frames))
+    save_arrays(folder / "logs.npz", **logs)
+    loaded["test"].save(folder / "test.npz", snapshots=False)
+
+
+def protocols_of(cell: Cell) -> tuple[Arming, ...]:
+    """Armings under which a cell is scored: without a disturbance there is no onset."""
+    return ("start",) if cell.tag == "none" else ARMINGS
+
+
+def test_panel(loaded: dict[str, HandoverTable], cell: Cell, protocol: Arming) -> Panel:
+    """Test episodes of a cell under an arming."""
+    return _panel(loaded["test"], loaded["test_nominal"], cell, protocol)
+
+
+def calibration_of(
+    loaded: dict[str, HandoverTable], task: Task, cell: Cell, protocol: Arming, seed: int
+) -> Calibration:
+    """Calibrate episodes of a cell under an arming."""
+    panel = _panel(loaded["calibrate"], loaded["calibrate_nominal"], task.calibrated_on(cell), protocol)
+    return Calibration(panel, loaded["calibrate_nominal"], seed=seed)
+
+
+def _panel(table: HandoverTable, nominal: HandoverTable, cell: Cell, protocol: Arming) -> Panel:
+    """Disturbed episodes, and under `start` their undisturbed twins beside them."""
+    if cell.tag == "none":
+        return Panel(nominal, protocol)
+    return Panel(concatenate([table, nominal]) if protocol == "start" else table, protocol)
+
+
+def _plain_rows(task: Task, cell: Cell, trained: Trained, test: Panel, rule: Any) -> pd.DataFrame:
+    """Rules that give control back have no table: drive the same episodes."""
+    driver, signals = trained.learner(task), trained.signals(task)
+    envs = {True: make_env(task, cell), False: make_env(task, task.none_cell)}
+    experts = {kind: env.make_expert() for kind, env in envs.items()}
+    episodes = [
+        run_episode(envs[bool(kind)], driver, signals, rule, experts[bool(kind)], int(seed), test.arming)
+        for seed, kind in zip(test.table.seeds, test.table.disturbed, strict=True)
+    ]
+    for env in envs.values():
+        env.close()
+    return episode_rows(test, episodes)
+
+
+def labelled(
+    rows: pd.DataFrame, cell: Cell, protocol: str, method_id: str, learner_seed: int, calibrated: Any, on: str
+) -> pd.DataFrame:
+    """Rows of `scoring.rows` with the columns that say what they are rows of."""
+    return rows.assign(
+        task=cell.task,
+        disturbance=cell.disturbance,
+        severity=cell.severity,
+        protocol=protocol,
+        method=method_id,
+        learner=learner_seed,
+        threshold=calibrated.threshold,
+        tuning_episodes=calibrated.tuning_episodes,
+        expert_queries=calibrated.expert_queries,
+        calibrated_on=on,
+    )
+
+
+def signals_job(
+    store: Store, task: Task, cell: Cell, trained: Trained, disturbed: tuple[str, ...], twins: tuple[str, ...]
+) -> Job:
+    """Signal quality of one (learner, cell), from tables of test episodes (or none) and of their undisturbed twins.
+
+    A disturbance that is only seen is judged on the twins' states, with and without it in view; then no disturbed
+    episode is needed for the frames.
+    """
+    settings = {"cell": str(cell), "learner_seed": trained.seed, "signals": list(task.signals)}
+    code = ["safeswitch.scoring.signal_quality", "safeswitch.handover.table", "safeswitch.handover.shown"]
+    key = store.key("signals", settings, [*trained.keys, *disturbed, *twins], code)
+    arguments = (str(store.root), task, cell, trained, disturbed, twins)
+    return Job("signals", f"{cell} learner {trained.seed}", key, _score_signals, arguments)
+
+
+def _score_signals(
+    folder: Path,
+    root: str,
+    task: Task,
+    cell: Cell,
+    trained: Trained,
+    disturbed_keys: tuple[str, ...],
+    twin_keys: tuple[str, ...],
+) -> None:
+    store = Store(Path(root))
+    twins = load_table(store, task, task.none_cell, twin_keys)
+    by_signal: dict[str, SignalQuality] = {}
+    if disturbed_keys:
+        disturbed = load_table(store, task, cell, disturbed_keys)
+        about = (disturbed.onset, disturbed.t_first, disturbed.learner_success)
+        for signal in task.signals:
+            by_signal[signal] = signal_quality(disturbed.signals[signal], twins.signals[signal], *about)
+    if only_seen(cell):
+        env = make_env(task, cell)
+        states = load_table(store, task, task.none_cell, twin_keys[:SHOWN_CHUNKS])
+        shown, visible = shown_traces(env, trained.learner(task), trained.signals(task), states)
+        env.close()
+        for signal in task.signals:
+            frames = frame_quality(shown[signal], states.signals[signal], visible)
+            before = by_signal.get(signal, frames)
+            by_signal[signal] = replace(frames, episode_auroc=before.episode_auroc)
+    rows = [{"signal": signal, **asdict(quality)} for signal, quality in by_signal.items()]
+    frame = pd.DataFrame(rows).assign(
+        task=cell.task, disturbance=cell.disturbance, severity=cell.severity, learner=trained.seed
+    )
+    save_frame(folder / "signals.npz", frame)
