@@ -36,7 +36,7 @@ test: setup ## run the tests, without the slow ones
 test-slow: setup ## run the slow tests: packaging, long properties, full protocols
 	$(BIN)/python -m pytest -m slow -n $(TEST_JOBS)
 
-perf: ## time the expert beside crocoddyl, and the handover table beside plain episodes
+perf: ## time the expert, pictures, decisions from images and the handover table, each beside a rival
 	@bash scripts/setup.sh dev,perf
 	$(BIN)/python -m safeswitch.perf
 

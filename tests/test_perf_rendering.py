@@ -81,3 +81,9 @@ def test_decisions_are_timed_per_frame_and_compared_with_the_first() -> None:
     assert learners["shared"].resets == 4  # three rounds and one that warms up
     with pytest.raises(ValueError, match="got 2 and 0"):
         perf_rendering.decision_ms(learners, frames[:0])
+
+
+@pytest.mark.rendering
+def test_sharing_the_trunk_pays() -> None:
+    results = perf_rendering.decision_benchmark()
+    assert results["dropout everywhere / trunk shared"] > 1, "thirty passes through the trunk instead of one"

@@ -34,7 +34,7 @@ from safeswitch.expert.codegen import FLAGS, find_compiler, source
 from safeswitch.expert.ddp import DDPSolver, Problem, Solution, make_solver
 from safeswitch.expert.graph import expanded
 from safeswitch.perf_handover import handover_benchmark
-from safeswitch.perf_rendering import rendering_benchmark
+from safeswitch.perf_rendering import decision_benchmark, rendering_benchmark
 from safeswitch.tasks.cart_pole import CartPoleConfig
 
 Array = NDArray[np.float64]
@@ -293,6 +293,7 @@ def main() -> None:
     benchmarks: dict[str, Callable[[], dict[str, Any]]] = {
         "expert": expert_benchmark,
         "rendering": rendering_benchmark,
+        "decision": decision_benchmark,
         "handover table": handover_benchmark,
     }
     for title, benchmark in benchmarks.items():

@@ -4,15 +4,17 @@ Each alternative draws the same states of the same model through the same camera
 one after the other, so that a busy machine slows all; ratios are medians over rounds. The bare loops use
 `mujoco.Renderer` as it comes (the quality that the model asks for), and with the settings of our fast pictures.
 
-The learners are arguments: the benchmark knows none. ``python -m safeswitch.perf`` prints all but the decisions.
+``python -m safeswitch.perf`` prints all of it.
 """
 
 from __future__ import annotations
 
 import copy
+import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -21,6 +23,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from safeswitch import demos, registry, suite
 from safeswitch.protocols import Learner
 from safeswitch.tasks.base import TaskEnv
 from safeswitch.tasks.opengl import describe_renderer
@@ -137,6 +140,23 @@ def steps_per_second(env: gym.Env[Any, Any], frames: int) -> float:
         if terminated or truncated:
             env.reset(seed=0)
     return frames / (time.perf_counter() - start)
+
+
+def decision_benchmark() -> dict[str, float]:
+    """Milliseconds of a decision of the image task's learner, K samples: trunk shared, and dropout in the trunk too.
+
+    Trained for one epoch on two episodes: the weights make no difference to the time.
+    """
+    task = suite.task("cart-pole-image")
+    train = registry.find("learner", task.learner).train
+    with tempfile.TemporaryDirectory() as folder:
+        demos.collect(task.env_id, task.dataset, Path(folder), suite.episode_seeds("train", 2))
+        data = demos.load(task.dataset, Path(folder))
+        learners = {
+            name: train(data, 0, {**task.learner_options, "epochs": 1, **more})
+            for name, more in {"trunk shared": {}, "dropout everywhere": {"trunk_dropout": 0.1}}.items()
+        }
+        return decision_ms(learners, data.episode(0))
 
 
 def decision_ms(learners: Mapping[str, Learner], frames: NDArray[np.uint8], repeats: int = 5) -> dict[str, float]:
