@@ -38,8 +38,8 @@ FIT_EPISODES = 250
 CHUNK = 20
 """Episodes per table job: small enough to resume from and to spread over workers."""
 
-SHOWN_CHUNKS = 2
-"""Chunks of undisturbed episodes (3,200 states) on which a disturbance that is only seen is shown to the signals."""
+SHOWN_CHUNKS = 1
+"""Chunks of undisturbed episodes (1,600 states a learner) on which a disturbance that is only seen is shown to the signals."""
 
 PHYSICS = (
     "safeswitch.seeding",
