@@ -28,8 +28,8 @@ from safeswitch.trained import Trained
 if TYPE_CHECKING:
     from safeswitch.protocols import Method
 
-SHOWN_CHUNKS = 2
-"""Chunks of undisturbed episodes (3,200 states) on which a disturbance that is only seen is shown to the signals."""
+SHOWN_CHUNKS = 1
+"""Chunks of undisturbed episodes (1,600 states) on which a disturbance that is only seen is shown to the signals."""
 
 
 def episodes_job(store: Store, task: Task, cell: Cell, trained: Trained, tables: CellTables, give_back: bool) -> Job:
