@@ -20,7 +20,7 @@ from safeswitch.handover.table import HandoverTable, concatenate
 from safeswitch.protocols import ARMINGS, Arming
 from safeswitch.scoring.rows import episode_rows, latched_rows
 from safeswitch.scoring.signal_quality import SignalQuality, frame_quality, signal_quality
-from safeswitch.stages import CellTables, Job, concat, load_table, make_env, only_seen, source_of
+from safeswitch.stages import CellTables, Job, concat, load_table, make_env, only_seen, recorded_table, source_of
 from safeswitch.store import Store
 from safeswitch.suite import Cell, Task, methods
 from safeswitch.trained import Trained
@@ -140,7 +140,12 @@ def signals_job(
     A disturbance that is only seen is judged on the twins' states, with and without it in view; then no disturbed
     episode is needed for the frames.
     """
-    settings = {"cell": str(cell), "learner_seed": trained.seed, "signals": list(task.signals)}
+    settings = {
+        "cell": str(cell),
+        "learner_seed": trained.seed,
+        "signals": list(task.signals),
+        "shown_chunks": SHOWN_CHUNKS,
+    }
     code = ["safeswitch.scoring.signal_quality", "safeswitch.handover.table", "safeswitch.handover.shown"]
     key = store.key("signals", settings, [*trained.keys, *disturbed, *twins], code)
     arguments = (str(store.root), task, cell, trained, disturbed, twins)
@@ -157,7 +162,7 @@ def _score_signals(
     twin_keys: tuple[str, ...],
 ) -> None:
     store = Store(Path(root))
-    twins = load_table(store, task, task.none_cell, twin_keys)
+    twins = recorded_table(store, twin_keys)
     by_signal: dict[str, SignalQuality] = {}
     if disturbed_keys:
         disturbed = load_table(store, task, cell, disturbed_keys)
@@ -166,7 +171,7 @@ def _score_signals(
             by_signal[signal] = signal_quality(disturbed.signals[signal], twins.signals[signal], *about)
     if only_seen(cell):
         env = make_env(task, cell)
-        states = load_table(store, task, task.none_cell, twin_keys[:SHOWN_CHUNKS])
+        states = recorded_table(store, twin_keys[:SHOWN_CHUNKS])
         shown, visible = shown_traces(env, trained.learner(task), trained.signals(task), states)
         env.close()
         for signal in task.signals:

@@ -187,11 +187,15 @@ def _tabulate(
     env.close()
 
 
+def recorded_table(store: Store, keys: tuple[str, ...]) -> HandoverTable:
+    """The chunks of a table put together, as they were recorded."""
+    return join_chunks([HandoverTable.load(store.folder(key) / "table.npz") for key in keys])
+
+
 def load_table(store: Store, task: Task, cell: Cell, keys: tuple[str, ...]) -> HandoverTable:
-    """The chunks of a table put together, with a simulator that resolves the outcomes still unknown."""
-    table = join_chunks([HandoverTable.load(store.folder(key) / "table.npz") for key in keys])
+    """The same with a simulator that resolves the outcomes still unknown."""
     env = make_env(task, cell)
-    return table.attach(env, env.make_expert())
+    return recorded_table(store, keys).attach(env, env.make_expert())
 
 
 @dataclass(frozen=True)
