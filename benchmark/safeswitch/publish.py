@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
-from safeswitch import pictures, registry
+from safeswitch import durations, pictures, registry
 from safeswitch.files import load_json, save_frame, save_json
 from safeswitch.scoring.comparisons import paired_comparisons
 from safeswitch.scoring.leaderboard import leaderboard, merge_task_rows, read_csv, write_csv
@@ -46,6 +46,7 @@ def publish(run: Run, folder: Path | None = None) -> Path:
     folder = (folder or default_folder(run.profile.name)).absolute()
     started = time.time()
     commit = git_commit()  # before anything is written into the checkout
+    run.plan, run.typical = run.stages, durations.stages(run.task.name, run.profile.name, folder)
     scores, spread, figures = run.scores, run.spread, run.figures
     folder.mkdir(parents=True, exist_ok=True)
     for name in TABLES:
@@ -169,7 +170,11 @@ def _manifest(run: Run, folder: Path, commit: str, seconds: float) -> dict[str, 
         "episodes": {"calibrate": run.profile.calibrate, "test": run.profile.test},
         "episode_seeds": {split: index * SPLIT_SIZE for index, split in enumerate(SPLITS)},
         "stage_seconds": {
-            name: {"wall, this run": round(wall, 1), "work, when computed": round(run.work[name], 1)}
+            name: {
+                "wall, this run": round(wall, 1),
+                "work, when computed": round(run.work[name], 1),
+                "jobs": run.jobs[name],
+            }
             for name, wall in run.seconds.items()
         },
         "wall_seconds": round(seconds, 1),
