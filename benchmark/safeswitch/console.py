@@ -15,9 +15,10 @@ from types import TracebackType
 from typing import Any
 
 from rich.console import Console, RenderableType
-from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import MofNCompleteColumn, ProgressColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.progress import Progress as RichProgress
 from rich.progress import Task as RichTask
+from rich.progress_bar import ProgressBar
 from rich.text import Text
 
 from safeswitch.files import jsonable
@@ -78,12 +79,12 @@ class Progress:
     """
 
     def __init__(self, label: str, total: int, done: int = 0, expected: float | None = None):
-        self.label, self.total, self.done, self.expected = label, total, done, expected
+        self.label, self.total, self.done, self.expected = label, total, done, expected  # a label may be padded
         self._started = self._last = time.perf_counter()
         self._finished = 0  # jobs finished by this run
         self._bar: RichProgress | None = None
         if bars():
-            columns = (SpinnerColumn(finished_text="[green]✓[/]"), TextColumn("{task.description}"), BarColumn(24))
+            columns = (SpinnerColumn(finished_text="[green]✓[/]"), TextColumn("{task.description}"), _Bar(self))
             self._bar = RichProgress(
                 *columns, MofNCompleteColumn(), TimeElapsedColumn(), _TimeLeft(self), console=log, expand=False
             )
@@ -94,7 +95,7 @@ class Progress:
             self._task = self._bar.add_task(self.label, total=self.total, completed=self.done)
         elif self.done < self.total:
             kept = f", {self.done} kept from before" if self.done else ""
-            log.print(f"{self.label}: {self.total - self.done} to do{kept} ... ", end="")
+            log.print(f"{self.label.rstrip()}: {self.total - self.done} to do{kept} ... ", end="")
             log.file.flush()
         return self
 
@@ -115,6 +116,14 @@ class Progress:
             return (self._last - self._started) / self._finished * rest - (now - self._last)
         return None if self.expected is None else self.expected - (now - self._started)
 
+    @property
+    def share(self) -> float:
+        """Share of the stage that is over: of the time where what is left is known, else of the jobs."""
+        left, elapsed = self.left, time.perf_counter() - self._started
+        if left is None or left <= 0:
+            return (self.done + self._finished) / max(self.total, 1)
+        return 1 - (1 - self.done / self.total) * left / (elapsed + left)
+
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
@@ -122,9 +131,21 @@ class Progress:
         if self._bar:
             self._bar.stop()
         elif self.done == self.total and kind is None:
-            log.print(f"{self.label}: kept from before")
+            log.print(f"{self.label.rstrip()}: kept from before")
         else:
             log.print(f"done in {seconds:.1f} s" if kind is None else f"stopped after {seconds:.1f} s")
+
+
+class _Bar(ProgressColumn):
+    """How much of a stage is over. One long job fills it, too, where it is known how long such a job takes."""
+
+    def __init__(self, progress: Progress):
+        self._progress = progress
+        super().__init__()
+
+    def render(self, task: RichTask) -> ProgressBar:
+        """The bar."""
+        return ProgressBar(total=1.0, completed=1.0 if task.finished else self._progress.share, width=24)
 
 
 class _TimeLeft(ProgressColumn):

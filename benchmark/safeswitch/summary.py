@@ -48,7 +48,7 @@ def announcement(runs: Sequence[Run], folder: Path) -> list[str]:
     if known and len(known) < len(times):
         guess += f", and an unknown time for {', '.join(task for task in times if task not in known)}"
     if known:
-        guess += "; on an idle machine like the one that was timed"
+        guess += ", on an idle machine"
     workers = f"{first.workers} worker{'s' if first.workers != 1 else ''}"
     return [
         f"SafeSwitch, profile {first.profile.name}: {', '.join(times)}, on {workers}",
