@@ -9,6 +9,8 @@ A quoted number is followed by an HTML comment, which no reader sees, that says 
 the name of a CSV file in results/, the cell, the row, the column. The number keeps as many digits as it has. Between
 `<!--rows leaderboard CELL PROTOCOL: METHOD METHOD ... -->` and `<!--/rows-->` stands a table of those methods.
 
+Between `<!--disturbances TASK-->` and `<!--/disturbances-->` stands the table of a task's disturbances, from the registry.
+
 Usage: python scripts/quote_results.py [--write] [FILE ...]     (default: every page of docs/, and README.md)
 Without --write it lists what differs; the exit code is then 1.
 """
@@ -33,6 +35,9 @@ ROWS = re.compile(
     r"(?P<open><!--rows (?P<table>\S+) (?P<cell>\S+) (?P<protocol>\S+): (?P<methods>[^>]*?) -->\n)"
     r".*?(?P<close><!--/rows-->)",
     re.DOTALL,
+)
+DISTURBANCES = re.compile(
+    r"(?P<open><!--disturbances (?P<task>\S+)-->\n).*?(?P<close><!--/disturbances-->)", re.DOTALL
 )
 KEYS = {
     "leaderboard": ("protocol", "method"),
@@ -94,7 +99,24 @@ def current(text: str) -> str:
             lines.append(f"| `{method}` | {interval} | {found['success']:.2f} | {found['autonomy']:.2f} | {skill} |")
         return match["open"] + "\n" + "\n".join(lines) + "\n\n" + match["close"]
 
-    return ROWS.sub(rows, NUMBER.sub(number, text))
+    def disturbances(match: re.Match[str]) -> str:
+        return match["open"] + "\n" + "\n".join(disturbance_table(match["task"])) + "\n\n" + match["close"]
+
+    return DISTURBANCES.sub(disturbances, ROWS.sub(rows, NUMBER.sub(number, text)))
+
+
+def disturbance_table(task: str) -> list[str]:
+    """Markdown table of what a task offers: name, what severity 3 does, the values of all severities."""
+    from safeswitch.tasks import visual  # noqa: F401  (registers the disturbances of images)
+    from safeswitch.tasks.disturbances import DISTURBANCES as OFFERED
+
+    lines = ["| disturbance | at severity 3 | severity 1 .. 5 |", "|---|---|---|"]
+    for name, kind in OFFERED.items():
+        if task in kind.tasks:
+            benign = " (benign)" if kind.benign else ""
+            levels = ", ".join(f"{level:g}" for level in kind.levels)
+            lines.append(f"| `{name}`{benign} | {kind.describe(3)} | {levels} |")
+    return lines
 
 
 def pages() -> list[Path]:
