@@ -9,7 +9,7 @@ A quoted number is followed by an HTML comment, which no reader sees, that says 
 the name of a CSV file in results/, the cell, the row, the column. The number keeps as many digits as it has. Between
 `<!--rows leaderboard CELL PROTOCOL: METHOD METHOD ... -->` and `<!--/rows-->` stands a table of those methods.
 
-Between `<!--disturbances TASK-->` and `<!--/disturbances-->` stands the table of a task's disturbances, from the registry.
+Between `<!--disturbances TASK-->` and `<!--/disturbances-->` stands the table of a task's disturbances.
 
 Usage: python scripts/quote_results.py [--write] [FILE ...]     (default: every page of docs/, and README.md)
 Without --write it lists what differs; the exit code is then 1.

@@ -1,8 +1,8 @@
 """The documentation: every code block works, every quoted number is that of the tables, every link leads somewhere.
 
-Python blocks of one page are run in order in one namespace, in an empty folder. Shell blocks are parsed by the shell and
-by the command line; those that cost nothing are run. A page with the comment `<!-- blocks: slow -->` is run with the slow
-tests, one with `<!-- blocks: SCRIPT -->` has a test of its own.
+Python blocks of one page are run in order in one namespace, in an empty folder. Shell blocks are parsed by the shell
+and by the command line; those that cost nothing are run. A page with the comment `<!-- blocks: slow -->` is run with
+the slow tests, one with `<!-- blocks: tests/test_NAME.py -->` has a test of its own.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ BLOCK = re.compile(r"^(?P<indent> *)```(?P<language>\w*)\n(?P<code>.*?)^(?P=inde
 SHELL = ("sh", "bash", "console", "shell")
 RUN = ("safeswitch list", "safeswitch list --json", "make help")
 """Commands in shell blocks that cost nothing and are run."""
-OUTSIDE = {"pip", "git", "cd", "export", "python", "jupyter", "tensorboard", "pytest", "pre-commit", "mkdir", "cp", "cat"}
+OUTSIDE = {"pip", "git", "cd", "export", "python", "jupyter", "tensorboard", "pytest", "pre-commit", "mkdir", "cat"}
 
 pytestmark = pytest.mark.skipif(not (ROOT / "pyproject.toml").is_file(), reason="needs the checkout")
 

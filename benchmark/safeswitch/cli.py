@@ -18,6 +18,7 @@ from rich.table import Table
 
 from safeswitch import registry, suite
 from safeswitch.console import StageError, answer, console, log, set_output
+from safeswitch.interrupts import for_this_process_alone
 
 
 @dataclass
@@ -279,7 +280,8 @@ def main(arguments: list[str] | None = None) -> int:
     """Entry point of the `safeswitch` command. Returns the exit code (see above)."""
     command = tyro.cli(Command, prog="safeswitch", description=__doc__, args=arguments)  # type: ignore[call-overload]
     try:
-        return command.run() or 0
+        with for_this_process_alone():
+            return command.run() or 0
     except ValueError as error:
         return _stopped(str(error), 2)
     except (StageError, OSError) as error:

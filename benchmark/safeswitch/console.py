@@ -92,7 +92,8 @@ class Progress:
     def __enter__(self) -> Progress:
         if self._bar:
             self._bar.start()
-            self._task = self._bar.add_task(self.label, total=self.total, completed=self.done)
+            self._task = self._bar.add_task(self.label, total=self.total)
+            self._bar.update(self._task, completed=self.done)  # finished at once where all was kept
         elif self.done < self.total:
             kept = f", {self.done} kept from before" if self.done else ""
             log.print(f"{self.label.rstrip()}: {self.total - self.done} to do{kept} ... ", end="")

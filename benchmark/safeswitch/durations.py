@@ -1,7 +1,8 @@
 """Roughly how long a run takes, from what earlier runs took: what `bench` says at its start and the bars show.
 
 The manifest that a run leaves beside its results says how long its jobs took. Where there is none of the same profile,
-`durations.json` is used: figures of the same kind, measured on two cores. Nothing but what is shown depends on them.
+`durations.json` is used: rounded figures of the same kind for two idle cores, split up over the stages from measured
+totals. Nothing but what is shown depends on them.
 """
 
 from __future__ import annotations

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -83,22 +84,19 @@ def headline(task: Task, table: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def headline_table(rows: Sequence[dict[str, Any]]) -> Table:
-    """The same as a table for people."""
+    """The same as a table for people, narrow enough for 80 columns."""
     table = Table(box=box.SIMPLE_HEAD, title="The paper's cell of each task", title_justify="left", title_style="bold")
-    for heading in ("task", "armed at", "", "method"):
-        table.add_column(heading, no_wrap=heading == "method")
+    table.add_column("method", no_wrap=True)
+    table.add_column("")
     for heading in ("return", "success", "autonomy"):
         table.add_column(heading, justify="right", no_wrap=True)
-    before: tuple[str, str] | None = None
-    for row in rows:
-        group = (row["task"], row["protocol"])
-        if before not in (None, group):
+    for (cell, protocol), group in groupby(rows, key=lambda row: (row["cell"], row["protocol"])):
+        if table.rows:
             table.add_section()
-        first = group if group != before else ("", "")
-        bold = "bold" if "best" in row["role"] else ""
-        numbers = (f"{row['return_mean']:.2f}", f"{row['success']:.2f}", f"{row['autonomy']:.2f}")
-        table.add_row(*first, row["role"], row["method"], *numbers, style=bold)
-        before = group
+        table.add_row(f"{cell}, armed at {protocol}", style="bold")
+        for row in group:
+            numbers = (f"{row['return_mean']:.2f}", f"{row['success']:.2f}", f"{row['autonomy']:.2f}")
+            table.add_row(f"  {row['method']}", row["role"], *numbers, style="green" if "best" in row["role"] else "")
     return table
 
 
