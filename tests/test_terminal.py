@@ -23,6 +23,7 @@ from safeswitch import cli, console, durations, pipeline, suite
 from safeswitch.console import Progress, StageError
 from safeswitch.interrupts import for_this_process_alone
 from safeswitch.pipeline import STAGES, Run
+from safeswitch.scoring.leaderboard import read_csv
 from safeswitch.store import Store
 from safeswitch.summary import announcement, headline
 
@@ -155,7 +156,8 @@ def test_without_a_guess_the_time_left_is_unknown(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize(
-    ("seconds", "text"), [(0.4, "0 s"), (59.4, "59 s"), (59.6, "1 min 00 s"), (725, "12 min 05 s"), (4830, "1 h 20 min")]
+    ("seconds", "text"),
+    [(0.4, "0 s"), (59.4, "59 s"), (59.6, "1 min 00 s"), (725, "12 min 05 s"), (4830, "1 h 20 min")],
 )
 def test_durations_are_readable(seconds: float, text: str) -> None:
     assert console.duration(seconds) == text
@@ -197,20 +199,13 @@ def test_the_headline_is_that_of_the_committed_leaderboard() -> None:
     path = Path(__file__).resolve().parents[1] / "results" / "leaderboard.csv"
     if not path.is_file():
         pytest.skip("needs the committed results")
-    table = cli_table(path)
-    rows = headline(TASK, table)
+    rows = headline(TASK, read_csv(path))
     by = {(row["protocol"], row["method"]): row for row in rows}
     for protocol in ("onset", "start"):
         best = [row for row in rows if row["protocol"] == protocol and "best rule" in row["role"]]
         assert len(best) == 1 and by[protocol, "oracle-hindsight"]["return_mean"] >= best[0]["return_mean"]
         assert {(protocol, name) for name in ("learner", "expert", "timer", "cem@total")} <= set(by)
     assert by["start", "expert"]["autonomy"] == 0
-
-
-def cli_table(path: Path) -> Any:
-    from safeswitch.scoring.leaderboard import read_csv
-
-    return read_csv(path)
 
 
 # ---- exit codes and answers
@@ -259,7 +254,8 @@ def test_a_setting_that_a_stage_refuses_is_bad_input(tmp_path: Path, monkeypatch
 @pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals")
 def test_ctrl_c_is_for_this_process_and_not_for_those_that_it_starts() -> None:
     with for_this_process_alone():
-        child = subprocess.Popen([sys.executable, "-c", "import time; print('up', flush=True); time.sleep(60)"], stdout=-1)
+        sleeper = "import time; print('up', flush=True); time.sleep(60)"
+        child = subprocess.Popen([sys.executable, "-c", sleeper], stdout=subprocess.PIPE)
         assert child.stdout is not None and child.stdout.readline() == b"up\n"
         child.send_signal(signal.SIGINT)
         time.sleep(0.2)

@@ -146,7 +146,8 @@ class _Bar(ProgressColumn):
 
     def render(self, task: RichTask) -> ProgressBar:
         """The bar."""
-        return ProgressBar(total=1.0, completed=1.0 if task.finished else self._progress.share, width=24)
+        share = 1.0 if task.finished else self._progress.share
+        return ProgressBar(total=1.0, completed=share, width=24, complete_style="cyan", finished_style="green")
 
 
 class _TimeLeft(ProgressColumn):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -90,10 +91,10 @@ def headline_table(rows: Sequence[dict[str, Any]]) -> Table:
     table.add_column("")
     for heading in ("return", "success", "autonomy"):
         table.add_column(heading, justify="right", no_wrap=True)
-    for (cell, protocol), group in groupby(rows, key=lambda row: (row["cell"], row["protocol"])):
+    for (cell, protocol, episodes), group in groupby(rows, key=itemgetter("cell", "protocol", "episodes")):
         if table.rows:
             table.add_section()
-        table.add_row(f"{cell}, armed at {protocol}", style="bold")
+        table.add_row(f"{cell}, armed at {protocol}", f"{episodes:.0f} episodes", style="bold")
         for row in group:
             numbers = (f"{row['return_mean']:.2f}", f"{row['success']:.2f}", f"{row['autonomy']:.2f}")
             table.add_row(f"  {row['method']}", row["role"], *numbers, style="green" if "best" in row["role"] else "")
