@@ -19,7 +19,7 @@ from safeswitch.tasks.track import Track
 
 Array = NDArray[np.float64]
 
-MET = (30, 95)
+MET = (45, 95)
 """Control steps, at the nominal speed, between which it is met."""
 STRIDE = 0.25
 """Distance of the places that are considered [m]."""
