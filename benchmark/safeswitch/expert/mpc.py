@@ -58,6 +58,8 @@ class MPCConfig:
         angles: indexes of the state's components that are angles [rad]; they may arrive wrapped or unwrapped.
         surprise: a warm plan is challenged by a cold start when its cost exceeds the last one's by this factor and
         surprise_margin: by this much.
+        following: indexes of the parameters that follow the state along, such as the bends of the road ahead. Where any
+            other parameter changes, the warm plan is challenged by a cold start.
     """
 
     warm_iterations: int = 10
@@ -67,6 +69,7 @@ class MPCConfig:
     angles: tuple[int, ...] = ()
     surprise: float = 1.2
     surprise_margin: float = 1.0
+    following: tuple[int, ...] = ()
 
 
 class MPC:
@@ -99,6 +102,7 @@ class MPC:
         self._plan = np.zeros_like(self._plan_out)
         self._gains = np.zeros_like(self._gains_out)
         self._parameters = np.zeros(self._np)
+        self._model = np.setdiff1d(np.arange(self._np), self.config.following)
         self._cost = np.inf
         self._age = -1  # steps since the plan in `_plan` was made; -1: no plan
 
@@ -146,7 +150,7 @@ class MPC:
         """Make a plan from `state`: warm if there is one to start from. False when no finite plan was found."""
         if self._age < 0:
             return self._cold(state, parameters)
-        expected, changed = self._cost, bool((parameters != self._parameters).any())
+        expected, changed = self._cost, bool((parameters != self._parameters)[self._model].any())
         good = self._warm(state, parameters)
         # Another model, or a cost that jumped (a push): the shifted plan may sit in a poor local minimum.
         if not good or changed or self._cost > self.config.surprise * expected + self.config.surprise_margin:
