@@ -1,12 +1,13 @@
 r"""A rally car for the expert: bicycle with saturating tyres in curvilinear coordinates, and its cost, in CasADi.
 
-State ``[s, e_y, e_psi, v_y, r, delta]``, with ``v_x`` appended when the throttle is a control too: arc length along the
-track's centre line [m], offset to its left [m], heading relative to it [rad], lateral velocity [m/s], yaw rate [rad/s],
-steering angle [rad] and forward velocity [m/s], all of the centre of mass. Controls: the steering target [rad], and the
-throttle in [-1, 1]. With half-axles l_f, l_r, loads N_f, N_r and the lateral slip velocity w of a tyre,
+State ``[s, e_y, e_psi, v_y, r, delta, v_x]``: arc length along the track's centre line [m], offset to its left [m],
+heading relative to it [rad], lateral velocity [m/s], yaw rate [rad/s], steering angle [rad] and forward velocity [m/s]
+of the centre of mass. Controls: the steering target [rad] and the throttle in [-1, 1]. With axle distances l_f, l_r,
+loads N_f, N_r and the lateral slip velocity w of a tyre,
 
 .. math::
-    m (\dot v_y + v_x r) &= F_f \cos\delta + F_r, \qquad I \dot r = l_f F_f \cos\delta - l_r F_r, \\
+    m (\dot v_y + v_x r) &= F_f \cos\delta + F_r, \qquad m (\dot v_x - v_y r) = F_x - F_f \sin\delta, \\
+    I \dot r &= l_f F_f \cos\delta - l_r F_r, \qquad \tau \dot\delta = u + b - \delta, \\
     F &= -\mu N w / \sqrt{(\mu w_0)^2 + w^2}, \quad
     w_f = (v_y + l_f r) \cos\delta - v_x \sin\delta, \quad w_r = v_y - l_r r, \\
     \dot s &= (v_x \cos e_\psi - v_y \sin e_\psi) / (1 - \kappa e_y), \quad
@@ -15,6 +16,10 @@ throttle in [-1, 1]. With half-axles l_f, l_r, loads N_f, N_r and the lateral sl
 A tyre is linear in its slip, N / w_0, up to its limit mu N. Tyres are stiff (a time constant of hundredths of a second,
 shorter at low speed), so v_y and r are stepped implicitly with the tyres' secant stiffness: stable at any speed, exact
 in steady cornering, which becomes the kinematic bicycle as v_x -> 0. One such step serves a whole control period.
+
+Where the speed is held by a controller of the car's own, the expert plans with the first five states (`steering_only`):
+v_x is a parameter, and the wheels follow their target at once. In closed loop that costs nothing, and the best target is
+then exactly independent of where the wheels stand.
 """
 
 from __future__ import annotations
@@ -57,29 +62,28 @@ TERMINAL = 5.0  # weight of the state's cost at the end of the horizon
 
 @dataclass(frozen=True)
 class Car:
-    """What does not change in an episode.
+    """What no disturbance changes, identified against the MuJoCo car (`safeswitch.expert.identification`).
 
     Attributes:
-        slip_front, slip_rear: w_0, slip velocity at which a linear tyre would carry its load [m/s].
-        steering_lag: time constant of the steering servo [s].
+        slip_front: w_0 of the front tyres, the slip velocity at which they would carry their load were they linear [m/s].
+        slip_rear: of the rear tyres [m/s].
+        steering_lag: time constant tau of the steering servo [s].
         drive: acceleration at full throttle [m/s^2].
-        drag: deceleration per forward velocity [1/s].
-        circles: where two circles that cover the car stand, ahead of the centre of mass [m].
+        circles: where two circles that cover the car have their centres, ahead of the centre of mass [m].
         circle_radius: [m].
     """
 
     slip_front: float = 0.15
     slip_rear: float = 0.15
-    steering_lag: float = 0.04
-    drive: float = 5.0
-    drag: float = 0.1
+    steering_lag: float = 0.05
+    drive: float = 3.94
     circles: tuple[float, float] = (0.28, -0.17)
-    circle_radius: float = 0.32
+    circle_radius: float = 0.34
 
 
 @dataclass(frozen=True)
 class Symbols:
-    """State, control and parameters of the model by name."""
+    """State, control and parameters of the model, and its parts by name."""
 
     x: ca.MX
     u: ca.MX
@@ -87,9 +91,14 @@ class Symbols:
 
     @classmethod
     def make(cls, steering_only: bool) -> Symbols:
-        """Six states and one control, or seven and two."""
-        nx, nu = (6, 1) if steering_only else (7, 2)
+        """Five states and one control, or seven and two."""
+        nx, nu = (5, 1) if steering_only else (7, 2)
         return cls(ca.MX.sym("x", nx), ca.MX.sym("u", nu), ca.MX.sym("p", len(PARAMETERS) + len(CONTEXT)))
+
+    @property
+    def steering_only(self) -> bool:
+        """Whether the speed is a parameter and the wheels follow at once."""
+        return bool(self.x.shape[0] == 5)
 
     @property
     def parameters(self) -> dict[str, ca.MX]:
@@ -98,8 +107,8 @@ class Symbols:
 
     @property
     def v_x(self) -> ca.MX:
-        """Forward velocity [m/s]: a state, or a parameter."""
-        return self.x[6] if self.x.shape[0] == 7 else self.parameters["speed"]
+        """Forward velocity [m/s]."""
+        return self.parameters["speed"] if self.steering_only else self.x[6]
 
 
 def curvature(s: ca.MX, parameters: dict[str, ca.MX]) -> ca.MX:
@@ -119,45 +128,57 @@ def dynamics(control_dt: float, steering_only: bool, car: Car) -> ca.Function:
     """(x, u, p) -> x after `control_dt` [s]: implicit in v_y and r, midpoint for the pose."""
     symbols, h = Symbols.make(steering_only), control_dt
     p, v_x = symbols.parameters, symbols.v_x
-    s, e_y, e_psi, v_y, r, delta = ca.vertsplit(symbols.x)[:6]
-    new_delta = delta + (1 - np.exp(-h / car.steering_lag)) * (symbols.u[0] + p["steering_bias"] - delta)
-    new_v_y, new_r = _lateral(p, v_x, v_y, r, 0.5 * (delta + new_delta), h, car)
+    s, e_y, e_psi, v_y, r = ca.vertsplit(symbols.x)[:5]
+    target = symbols.u[0] + p["steering_bias"]
+    if steering_only:
+        new_v_y, new_r, _ = _lateral(p, v_x, v_y, r, target, h, car)
+        rest = []
+    else:
+        delta = symbols.x[5]
+        new_delta = delta + (1 - np.exp(-h / car.steering_lag)) * (target - delta)
+        new_v_y, new_r, brake = _lateral(p, v_x, v_y, r, 0.5 * (delta + new_delta), h, car)
+        new_v_x = v_x + h * (car.drive * symbols.u[1] - brake + 0.5 * (v_y + new_v_y) * 0.5 * (r + new_r))
+        rest = [new_delta, new_v_x]
+        v_x = 0.5 * (v_x + new_v_x)
 
     kappa, v, w = middle_curvature(symbols, h), 0.5 * (v_y + new_v_y), 0.5 * (r + new_r)
-    new_v_x = v_x
-    if not steering_only:
-        new_v_x = v_x + h * (car.drive * symbols.u[1] - car.drag * v_x)
-        v_x = 0.5 * (v_x + new_v_x)
     s_dot = (v_x * ca.cos(e_psi) - v * ca.sin(e_psi)) / _stretch(kappa, e_y)
     psi, e = e_psi + h / 2 * (w - kappa * s_dot), e_y + h / 2 * (v_x * ca.sin(e_psi) + v * ca.cos(e_psi))
     s_dot = (v_x * ca.cos(psi) - v * ca.sin(psi)) / _stretch(kappa, e)
     e_dot = v_x * ca.sin(psi) + v * ca.cos(psi)
-    end = [s + h * s_dot, e_y + h * e_dot, e_psi + h * (w - kappa * s_dot), new_v_y, new_r, new_delta]
-    end = end if steering_only else [*end, new_v_x]
-    return ca.Function("rally_car_dynamics", [symbols.x, symbols.u, symbols.p], [ca.vertcat(*end)])
+    pose = [s + h * s_dot, e_y + h * e_dot, e_psi + h * (w - kappa * s_dot)]
+    return ca.Function(
+        "rally_car_dynamics",
+        [symbols.x, symbols.u, symbols.p],
+        [ca.vertcat(*pose, new_v_y, new_r, *rest)],
+        ["x", "u", "p"],
+        ["x_next"],
+    )
 
 
 def _stretch(kappa: ca.MX, e_y: ca.MX) -> ca.MX:
-    """Length of a step along the centre line at the offset e_y; kept away from 0, the centre of a bend."""
+    """Length of a step at the offset e_y per length along the centre line; kept away from 0, the centre of a bend."""
     return ca.fmax(1 - kappa * e_y, 0.3)
 
 
 def _lateral(
     p: dict[str, ca.MX], v_x: ca.MX, v_y: ca.MX, r: ca.MX, delta: ca.MX, h: float, car: Car
-) -> tuple[ca.MX, ca.MX]:
-    """(v_y, r) after h [s]: an implicit Euler step with the tyres' secant stiffness at its beginning."""
+) -> tuple[ca.MX, ca.MX, ca.MX]:
+    """(v_y, r, deceleration by the steered wheels) after h [s]: implicit Euler with the tyres' secant stiffness."""
     mass, inertia, l_f, l_r, mu = (p[name] for name in PARAMETERS[:5])
     cos, sin = ca.cos(delta), ca.sin(delta)
     load = mu * mass * GRAVITY / (l_f + l_r)
     w_f, w_r = (v_y + l_f * r) * cos - v_x * sin, v_y - l_r * r
-    c_f = l_r * load / ca.sqrt((mu * car.slip_front) ** 2 + w_f**2)
+    stiff_f = l_r * load / ca.sqrt((mu * car.slip_front) ** 2 + w_f**2)
     c_r = l_f * load / ca.sqrt((mu * car.slip_rear) ** 2 + w_r**2)
-    push, c_f = c_f * cos * sin * v_x, c_f * cos**2
+    push, c_f = stiff_f * cos * sin * v_x, stiff_f * cos**2
     a11, a12 = mass / h + c_f + c_r, l_f * c_f - l_r * c_r + mass * v_x
     a21, a22 = l_f * c_f - l_r * c_r, inertia / h + l_f**2 * c_f + l_r**2 * c_r
     b1, b2 = mass / h * v_y + push, inertia / h * r + l_f * push
     inverse = 1 / (a11 * a22 - a12 * a21)
-    return (a22 * b1 - a12 * b2) * inverse, (a11 * b2 - a21 * b1) * inverse
+    new_v_y, new_r = (a22 * b1 - a12 * b2) * inverse, (a11 * b2 - a21 * b1) * inverse
+    force = stiff_f * (v_x * sin - (new_v_y + l_f * new_r) * cos)
+    return new_v_y, new_r, force * sin / mass
 
 
 def _state_residual(symbols: Symbols, kappa: ca.MX, half_width: float, car: Car) -> list[ca.MX]:
@@ -175,7 +196,7 @@ def _state_residual(symbols: Symbols, kappa: ca.MX, half_width: float, car: Car)
         along = (s + ahead * cos - p["obstacle_s"]) * _stretch(kappa, p["obstacle_e"])
         distance = ca.sqrt(along**2 + (e - p["obstacle_e"]) ** 2 + 1e-6)
         rows.append(np.sqrt(WEIGHT_OBSTACLE) * ca.fmax(clear - distance, 0))
-    if symbols.x.shape[0] == 7:
+    if not symbols.steering_only:
         rows.append(np.sqrt(WEIGHT_SPEED) * (symbols.x[6] - p["speed"]))
     return rows
 
@@ -184,7 +205,7 @@ def residuals(control_dt: float, steering_only: bool, half_width: float, car: Ca
     """Stage residual (x, u, p) -> r and terminal residual (x, p) -> r_N.
 
     Steering is charged for what it adds to the bend's own, atan((l_f + l_r) kappa), not for its rate: the best target
-    then hardly depends on where the wheels stand, and can be told from an image.
+    is then a function of the pose, which an image shows, and not of the last target.
     """
     symbols = Symbols.make(steering_only)
     x, u, p = symbols.x, symbols.u, symbols.parameters
@@ -192,7 +213,7 @@ def residuals(control_dt: float, steering_only: bool, half_width: float, car: Ca
     state = _state_residual(symbols, kappa, half_width, car)
     effort = [np.sqrt(WEIGHT_STEERING) * (u[0] + p["steering_bias"] - ca.atan((p["l_f"] + p["l_r"]) * kappa))]
     if not steering_only:
-        effort.append(np.sqrt(WEIGHT_THROTTLE) * (u[1] - car.drag / car.drive * p["speed"]))
+        effort.append(np.sqrt(WEIGHT_THROTTLE) * (u[1]))
     return (
         ca.Function("rally_car_residual", [x, u, symbols.p], [ca.vertcat(*state, *effort)]),
         ca.Function("rally_car_terminal", [x, symbols.p], [np.sqrt(TERMINAL) * ca.vertcat(*state)]),

@@ -1,7 +1,7 @@
 """The rally car's expert: where the track bends ahead, first plans around an obstacle, and `make_rally_car_expert`.
 
 The model and its cost are in `safeswitch.expert.bicycle`. The action is the absolute steering angle of a converged plan,
-which depends on the car's pose and hardly on where the wheels stand: a learner can tell it from one image.
+a function of the car's pose and motion and not of where its wheels stand: a learner can tell it from one image.
 """
 
 from __future__ import annotations
@@ -86,10 +86,10 @@ class LaneCandidates:
         kappa = self._window.curvature(state[0] + reach)
         u, x = np.zeros((self._horizon, self._nu)), np.zeros((self._horizon + 1, self._nx))
         x[:, 2], x[:, 3], x[:, 4] = -p["l_r"] * kappa, p["l_r"] * kappa * v_x, kappa * v_x
-        x[:, 5] = np.arctan((p["l_f"] + p["l_r"]) * kappa)
-        u[:, 0] = x[:-1, 5] - p["steering_bias"]
+        bend = np.arctan((p["l_f"] + p["l_r"]) * kappa)
+        u[:, 0] = bend[:-1] - p["steering_bias"]
         if self._nx == 7:
-            x[:, 6], u[:, 1] = p["speed"], self._car.drag / self._car.drive * p["speed"]
+            x[:, 5], x[:, 6] = bend, p["speed"]
         K = self._lane_keeping(parameters, p["speed"])
         policies = [Policy(u=u, x=x, K=K)]
         if not -1.0 < p["obstacle_s"] - state[0] < reach[-1] + 1.0:
@@ -110,7 +110,7 @@ class LaneCandidates:
         straight[BIAS], straight[SPEED] = 0.0, speed
         x, u = np.zeros(self._nx), np.zeros(self._nu)
         if self._nx == 7:
-            x[6], u[1] = speed, self._car.drag / self._car.drive * speed
+            x[6] = speed
         return self._gain(x, u, straight)
 
 
@@ -127,7 +127,7 @@ class RallyCarExpert:
         self.mpc = mpc
         self._window = window
         self._speed = speed
-        self._columns = [0, 1, 2, 4, 5, 6] if speed is None else [0, 1, 2, 4, 5, 6, 3]
+        self._columns = [0, 1, 2, 4, 5] if speed is None else [0, 1, 2, 4, 5, 6, 3]
         self._units = np.array([STEERING_LIMIT, 1.0][: mpc.solver.problem.nu])
         self._parameters = np.zeros(mpc.solver.problem.np)
         self._s: float | None = None
