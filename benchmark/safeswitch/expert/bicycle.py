@@ -17,9 +17,9 @@ A tyre is linear in its slip, N / w_0, up to its limit mu N. Tyres are stiff (a 
 shorter at low speed), so v_y and r are stepped implicitly with the tyres' secant stiffness: stable at any speed, exact
 in steady cornering, which becomes the kinematic bicycle as v_x -> 0. One such step serves a whole control period.
 
-Where the speed is held by a controller of the car's own, the expert plans with the first five states (`steering_only`):
-v_x is a parameter, and the wheels follow their target at once. In closed loop that costs nothing, and the best target is
-then exactly independent of where the wheels stand.
+Where the speed is held by a controller of the car's own, the expert plans with the first five states
+(`steering_only`): v_x is a parameter, and the wheels follow their target at once. That costs nothing in closed loop,
+and the best target is then exactly independent of where the wheels stand.
 """
 
 from __future__ import annotations
@@ -53,8 +53,9 @@ CONTEXT: tuple[str, ...] = ("speed", "spacing", "first_s", "first_curvature", *(
 GRAVITY = 9.81  # [m/s^2]
 STEERING_LIMIT = 0.40  # [rad]
 
-WEIGHT_OFFSET, WEIGHT_COURSE, WEIGHT_STEERING = 1.0, 0.5, 4.0  # of e_y [m], course [rad], steering beyond the bend's [rad]
-WEIGHT_SPEED, WEIGHT_THROTTLE = 0.5, 0.5
+WEIGHT_OFFSET, WEIGHT_COURSE = 1.0, 0.5  # e_y [m], course of the centre of mass along the track [rad]
+WEIGHT_STEERING = 4.0  # what the target adds to the bend's own steering [rad]
+WEIGHT_SPEED, WEIGHT_THROTTLE = 0.5, 0.5  # [m/s], [-1, 1]; only where the throttle is a control
 WEIGHT_BORDER, WEIGHT_OBSTACLE = 1000.0, 3000.0  # squared hinges [m]
 BORDER_MARGIN, OBSTACLE_MARGIN = 0.10, 0.12  # [m] beyond touching
 TERMINAL = 5.0  # weight of the state's cost at the end of the horizon
@@ -65,7 +66,7 @@ class Car:
     """What no disturbance changes, identified against the MuJoCo car (`safeswitch.expert.identification`).
 
     Attributes:
-        slip_front: w_0 of the front tyres, the slip velocity at which they would carry their load were they linear [m/s].
+        slip_front: w_0 of the front tyres, the slip velocity at which linear tyres would carry their load [m/s].
         slip_rear: of the rear tyres [m/s].
         steering_lag: time constant tau of the steering servo [s].
         drive: acceleration at full throttle [m/s^2].
@@ -182,7 +183,7 @@ def _lateral(
 
 
 def _state_residual(symbols: Symbols, kappa: ca.MX, half_width: float, car: Car) -> list[ca.MX]:
-    """Offset, course, and hinges of two circles on the car to the borders and to the obstacle; 0.5 |.|^2 is the cost."""
+    """Offset, course, and hinges of two circles on the car to borders and obstacle; 0.5 |.|^2 is the cost."""
     p = symbols.parameters
     s, e_y, e_psi, v_y = ca.vertsplit(symbols.x)[:4]
     course = e_psi + v_y / ca.fmax(symbols.v_x, 1)  # of the centre of mass; a car in a bend points elsewhere
@@ -211,7 +212,11 @@ def residuals(control_dt: float, steering_only: bool, half_width: float, car: Ca
     x, u, p = symbols.x, symbols.u, symbols.parameters
     kappa = middle_curvature(symbols, control_dt)
     state = _state_residual(symbols, kappa, half_width, car)
-    effort = [np.sqrt(WEIGHT_STEERING) * (u[0] + p["steering_bias"] - ca.atan((p["l_f"] + p["l_r"]) * kappa))]
+    preview = kappa
+    if not steering_only:  # where the car is when the wheels have followed
+        preview = curvature(x[0] + (0.5 * control_dt + car.steering_lag) * symbols.v_x, p)
+    bend = ca.atan((p["l_f"] + p["l_r"]) * preview)
+    effort = [np.sqrt(WEIGHT_STEERING) * (u[0] + p["steering_bias"] - bend)]
     if not steering_only:
         effort.append(np.sqrt(WEIGHT_THROTTLE) * (u[1]))
     return (

@@ -1,7 +1,7 @@
 """The rally car's expert: where the track bends ahead, first plans around an obstacle, and `make_rally_car_expert`.
 
-The model and its cost are in `safeswitch.expert.bicycle`. The action is the absolute steering angle of a converged plan,
-a function of the car's pose and motion and not of where its wheels stand: a learner can tell it from one image.
+The model and its cost are in `safeswitch.expert.bicycle`. The action is the absolute steering angle of a converged
+plan, a function of the car's pose and motion and not of where its wheels stand: a learner can tell it from one image.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class CurvatureWindow:
         self._curvature = np.append(curvature, curvature[0])
 
     def write(self, s: float, out: Array) -> None:
-        """Write spacing, first_s, first_curvature and bends (3 + KNOTS,) of the window that begins at or before s [m]."""
+        """Write spacing, first_s, first_curvature and bends (3 + KNOTS,) of the window that begins around s [m]."""
         first = math.floor(s / self.spacing)
         out[0], out[1] = self.spacing, first * self.spacing
         out[2:] = self._rows[first % len(self._rows)]
@@ -71,8 +71,15 @@ class LaneCandidates:
     left and right of it, each also after a swerve at full steering.
     """
 
-    def __init__(self, problem: Problem, control_dt: float, half_width: float, car: Car, window: CurvatureWindow,
-                 compiled: bool = True) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        control_dt: float,
+        half_width: float,
+        car: Car,
+        window: CurvatureWindow,
+        compiled: bool = True,
+    ) -> None:
         self._gain = StationaryGain(problem, compiled=compiled)
         self._window, self._dt, self._car = window, control_dt, car
         self._nx, self._nu, self._horizon = problem.nx, problem.nu, problem.horizon
@@ -192,6 +199,11 @@ def make_rally_car_expert(
     solver = make_solver(name, model, stage, terminal, HORIZON, -bounds, bounds, compiled=compiled)
     window = CurvatureWindow(track)
     candidates = LaneCandidates(solver.problem, control_dt, track.half_width, car, window, compiled)
-    following = tuple(range(SPEED, len(PARAMETERS) + len(CONTEXT))) if steering_only else tuple(range(SPACING, len(PARAMETERS) + len(CONTEXT)))
-    config = MPCConfig(warm_iterations=4, cold_iterations=15, polish_iterations=40, tolerance=1e-5, angles=(2,), following=following)
+    config = MPCConfig(
+        warm_iterations=4,
+        cold_iterations=15,
+        polish_iterations=40,
+        angles=(2,),
+        following=tuple(range(SPEED, solver.problem.np)),
+    )
     return RallyCarExpert(MPC(solver, candidates, config), window, None if steering_only else speed)
