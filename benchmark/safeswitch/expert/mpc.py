@@ -77,6 +77,7 @@ class MPC:
 
     Attributes:
         solver: the generated DDP solver.
+        candidates: initial policies of a cold start.
         fallbacks: how often an action came from an old plan because the solver failed, since construction.
         cold_starts: plans made from scratch, since construction.
         iterations: DDP iterations, since construction.
@@ -89,7 +90,7 @@ class MPC:
         self.fallbacks = 0
         self.cold_starts = 0
         self.iterations = 0
-        self._candidates = candidates
+        self.candidates = candidates
         self._nx, self._nu, self._np = problem.nx, problem.nu, problem.np
         self._lo, self._hi = np.array(problem.u_lo), np.array(problem.u_hi)
         self._angles = list(self.config.angles)
@@ -181,7 +182,7 @@ class MPC:
             self._x0[i] = _wrapped(state[i])
         self._p[:] = parameters
         best, best_plan, best_gains = np.inf, None, None
-        for policy in self._candidates(self._x0.copy(), parameters):
+        for policy in self.candidates(self._x0.copy(), parameters):
             self._plan_in[:, : self._nx] = policy.x
             self._plan_in[:horizon, self._nx :] = policy.u
             self._gains_in.reshape(horizon, self._nx, self._nu)[:] = np.swapaxes(
