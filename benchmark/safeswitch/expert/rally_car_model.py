@@ -30,7 +30,6 @@ SPACING = SPEED + CONTEXT.index("spacing")
 STRAIGHT_FROM = SPEED + CONTEXT.index("first_s")
 NOWHERE = -1e4  # [m] s of an obstacle that is not there
 SLOWEST = 1.0  # [m/s] at which the steering is planned: a parked car plans as if it moved
-SWERVE_STEPS = 6  # of full steering, in the first plans that start with a swerve
 SHY = 0.05  # [m] by which first plans pass an obstacle further off than its cost asks for
 
 
@@ -68,7 +67,7 @@ class CurvatureWindow:
 
 class LaneCandidates:
     """First plans of a cold start: lane keeping under LQR feedback, straight on and, if there is an obstacle in reach,
-    left and right of it, each also after a swerve at full steering.
+    left and right of it.
     """
 
     def __init__(
@@ -103,10 +102,9 @@ class LaneCandidates:
             return policies
         aside = p["obstacle_radius"] + self._car.circle_radius + bicycle.OBSTACLE_MARGIN + SHY
         for side in (1.0, -1.0):
-            past, swerve = x.copy(), u.copy()
+            past = x.copy()
             past[:, 1] = min(max(p["obstacle_e"] + side * aside, -self._lane), self._lane)
-            swerve[:SWERVE_STEPS, 0] = side * STEERING_LIMIT
-            policies += [Policy(u=u, x=past, K=K), Policy(u=swerve, x=past, K=K)]
+            policies.append(Policy(u=u, x=past, K=K))
         return policies
 
     def _lane_keeping(self, parameters: Array, speed: float) -> Array:
@@ -201,7 +199,7 @@ def make_rally_car_expert(
     candidates = LaneCandidates(solver.problem, control_dt, track.half_width, car, window, compiled)
     config = MPCConfig(
         warm_iterations=4,
-        cold_iterations=15,
+        cold_iterations=12,
         polish_iterations=40,
         angles=(2,),
         following=tuple(range(SPEED, solver.problem.np)),
