@@ -62,7 +62,7 @@ def rally_car(track: Track, timestep: float, actions: int) -> mujoco.MjModel:
     tree.statistic.extent = 1.0  # near and far plane are then in metres
     tree.statistic.center = [0.0, 0.0, 0.0]
     tree.visual.map.zfar = 70.0
-    tree.visual.map.shadowclip = 3.0
+    tree.visual.map.shadowclip = 1.5
     tree.visual.quality.shadowsize = 2048
     _lay_ground(tree)
     _build_tubes(tree, track)
@@ -208,7 +208,7 @@ def ground_picture(track: Track) -> NDArray[np.uint8]:
         return total / np.sqrt(len(sizes))
 
     fine, coarse = grain(1, 3), grain(12, 40)
-    ruts = np.exp(-((np.abs(offset) - 0.19) ** 2) / (2 * 0.09**2)) * (0.7 + 0.15 * coarse)
+    ruts = np.exp(-((np.abs(offset) - 0.19) ** 2) / (2 * 0.09**2)) * (0.9 + 0.15 * coarse)
     dust = np.clip((np.abs(offset) - 0.7) / 0.8, 0.0, 1.0)
     dirt = _mix(_mix(DIRT, DRY, np.clip(0.6 * dust + 0.15 * coarse, 0.0, 1.0)), RUT, np.clip(ruts, 0.0, 1.0))
     wild = _mix(GRASS, STONE, np.clip(0.35 + 0.3 * coarse, 0.0, 1.0))
