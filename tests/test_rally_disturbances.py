@@ -8,12 +8,12 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from test_rally_car import IMAGE, STATE, drive, lane_keeping, make
 
 from safeswitch.tasks.base import TaskEnv
 from safeswitch.tasks.disturbances import DISTURBANCES, SEVERITIES, offered
 from safeswitch.tasks.rally_disturbances import Obstacle, ObstacleHeldOut, Placed
 from safeswitch.tasks.sight import surface_points
+from test_rally_car import IMAGE, STATE, drive, lane_keeping, make
 
 PLACED = [name for name in offered("rally-car-image") if DISTURBANCES[name].placed]
 SEEN = [name for name in offered("rally-car-image") if DISTURBANCES[name].only_seen]
@@ -49,7 +49,8 @@ def test_first_sight_is_the_first_picture_that_differs(name: str, track: str) ->
             env.advance(lane_keeping(env))
             shows.append(bool(np.any(env.observe() != env.observe(clean=True))))
         first = 1 + shows.index(True)
-        assert abs(first - env.onset) <= 1, (name, track, seed)
+        flat = env.disturbance.body == "patch_round"  # seen at a grazing angle
+        assert abs(first - env.onset) <= (2 if flat else 1), (name, track, seed)
     env.close()
 
 
@@ -89,18 +90,16 @@ def test_a_severe_obstacle_comes_into_view_later() -> None:
 def test_a_bank_hides_what_is_behind_it() -> None:
     env = make(disturbance="obstacle")
     env.reset(seed=0)
-    sight, points = env._eye_of(), np.array([[0.0, 0.0, 0.3]])
+    sight = env._eye_of()
     s = 20.0
     x, y = env.track.position(s)
     left = float(env.track.heading(s)) + math.pi / 2
     quaternion = np.array([math.cos(left / 2), 0.0, 0.0, math.sin(left / 2)])
     eye = np.array([x, y, 0.12])
-    for e_y, height, expected in ((1.3, 0.1, True), (2.9, 0.4, False), (2.9, 2.0, True)):
-        points = np.array([[*env.track.point(s, e_y), height]])
-        if expected and height > 1.0:  # above the picture's upper edge from nearby
-            points = np.array([[*env.track.point(s, 9.0), height]])
-        assert sight.sees(eye, quaternion, points) == expected, (e_y, height)
-    behind = np.array([[*env.track.point(s, -1.0), 0.1]])
+    for e_y, height, expected in ((1.3, 0.1, True), (2.9, 0.4, False), (2.9, 1.0, True)):
+        post = np.array([[*env.track.point(s, e_y), low] for low in (height - 0.1, height)])
+        assert sight.sees(eye, quaternion, post) == expected, (e_y, height)
+    behind = np.array([[*env.track.point(s, -1.0), low] for low in (0.1, 0.4)])
     assert not sight.sees(eye, quaternion, behind)
 
 

@@ -36,8 +36,8 @@ PIECE = 0.5
 """Length of the pieces of tubes and banks along the track [m]."""
 BANK: tuple[tuple[float, float], ...] = ((0.20, -0.02), (0.65, 0.62), (0.85, 0.75), (1.05, 0.62), (1.55, -0.02))
 """Cross-section of a bank: distance beyond the edge, height [m]. A lens 0.30 m high sees nothing behind it."""
-BANK_GROUP = 2
-"""Geom group of the banks, by which rays of sight find them."""
+HIDING_GROUP = 2
+"""Geom group of banks and tubes, by which rays of sight find them."""
 BACKDROP_HEIGHT = 14.0
 """[m]: fills the onboard camera's view above the horizon from anywhere on the track."""
 BACKDROP = (128, 512)
@@ -62,7 +62,7 @@ def rally_car(track: Track, timestep: float, actions: int) -> mujoco.MjModel:
     tree.statistic.extent = 1.0  # near and far plane are then in metres
     tree.statistic.center = [0.0, 0.0, 0.0]
     tree.visual.map.zfar = 70.0
-    tree.visual.map.shadowclip = 1.5
+    tree.visual.map.shadowclip = 2.0
     tree.visual.quality.shadowsize = 2048
     _lay_ground(tree)
     _build_tubes(tree, track)
@@ -93,13 +93,13 @@ def _build_tubes(tree: Any, track: Track) -> None:
     material = tree.asset.add("material", name="tube", rgba=[0.06, 0.06, 0.07, 1.0], specular=0.4, shininess=0.4)
     angles = np.linspace(math.radians(210), math.radians(-30), 6)  # open where it lies on the ground
     section = [(TUBE_OFFSET + TUBE_RADIUS * math.cos(a), TUBE_RADIUS * (0.5 + math.sin(a))) for a in angles]
-    _build_along(tree, track, "tube", material, section, group=1)
+    _build_along(tree, track, "tube", material, section)
 
 
 def _build_banks(tree: Any, track: Track) -> None:
     """An earth bank behind either tube."""
     material = tree.asset.add("material", name="bank", rgba=[0.50, 0.44, 0.28, 1.0], specular=0.0, shininess=0.0)
-    _build_along(tree, track, "bank", material, BANK, group=BANK_GROUP, roughness=0.06)
+    _build_along(tree, track, "bank", material, BANK, roughness=0.06)
 
 
 def _build_along(
@@ -108,7 +108,6 @@ def _build_along(
     name: str,
     material: Any,
     section: Sequence[tuple[float, float]],
-    group: int,
     roughness: float = 0.0,
 ) -> None:
     """A mesh on either side of the track: a cross-section (distance beyond the edge, height) [m] carried around it."""
@@ -132,7 +131,7 @@ def _build_along(
             contype=0,
             conaffinity=0,
             mass=0,
-            group=group,
+            group=HIDING_GROUP,
         )
 
 

@@ -59,10 +59,13 @@ class Placing:
         cost = rng.uniform(0.0, SCATTER, len(places))
         if placed.sight is not None:
             cost += np.abs(self.distances(places, placed.lateral) - placed.sight)
-        for s in places[np.argsort(cost)]:
-            placed.place(self.model, self.track, float(s))
-            if not self.sight.sees(qpos[:3], qpos[3:7], placed.points) and self._shows(placed, float(s)):
-                return
+        order = places[np.argsort(cost)]
+        for side in (1.0, -1.0):  # the other side where this one offers nothing
+            placed.lateral *= side
+            for s in order:
+                placed.place(self.model, self.track, float(s))
+                if not self.sight.sees(qpos[:3], qpos[3:7], placed.points) and self._shows(placed, float(s)):
+                    return
 
     def _shows(self, placed: Placed, s: float) -> bool:
         """Whether a car in the middle of the track sees it on the way to arc length `s` [m]."""
