@@ -91,7 +91,7 @@ class NeverSwitch:
 
 
 def arming_step(onset: int | None, arming: Arming, horizon: int) -> int:
-    """First step at which the monitor is on: t0 under `onset` (T, i.e. never, without a disturbance), 0 under `start`."""
+    """First step at which the monitor is on: t0 under `onset` (T, that is never, undisturbed), 0 under `start`."""
     if arming == "start":
         return 0
     if arming == "onset":

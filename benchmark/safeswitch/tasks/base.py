@@ -4,9 +4,9 @@ An episode is a function of its seed. Three named streams feed it, `initial-stat
 undisturbed twin (same seed, ``disturbance=None``) starts in the same state and is identical until the onset step t0.
 
 The disturbance sets in before the observation of step t0: from there on the simulator steps with its disturbed model.
-t0 is drawn, and which model is in force is a function of the step index alone. A `placed` disturbance is different: it
-stands somewhere in the world from the reset on, and t0 is the first step at which the trajectory at hand shows it. Until
-then nothing that is observed, and no parameter, tells of it; a snapshot remembers whether it has been seen.
+t0 is drawn, and which model is in force is a function of the step index alone. A `placed` disturbance is different:
+it stands in the world from the reset on, and t0 is the first step at which the trajectory at hand shows it. Until then
+nothing that is observed, and no parameter, tells of it; a snapshot remembers whether it has been seen.
 """
 
 from __future__ import annotations
@@ -346,9 +346,8 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
             return
         if self._placed:
             if given_onset is not None:
-                raise ValueError(
-                    f"the onset of {self.disturbance.name!r} is the first step at which it is in view: it cannot be given"
-                )
+                name = self.disturbance.name  # type: ignore[union-attr]
+                raise ValueError(f"the onset of {name!r} is the first step at which it is in view: it cannot be given")
             self._onset = None
         else:
             drawn = self._draw_onset(stream(seed, "onset"))

@@ -54,7 +54,10 @@ SKY_LOW, SKY_HIGH, HILLS, TREES = (
 
 @lru_cache(maxsize=8)
 def rally_car(track: Track, timestep: float, actions: int) -> mujoco.MjModel:
-    """Compiled car on `track`, with room for an action of some numbers. Shared within the process: copy it before changing it."""
+    """Compiled car on `track`, with room for an action of `actions` numbers.
+
+    Shared within the process: copy it before changing it.
+    """
     tree = models.compose("rally_car/rally_car.xml")
     tree.include_copy(models.part("rally_car/course.xml"))
     tree.option.timestep = timestep

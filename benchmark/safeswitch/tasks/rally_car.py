@@ -149,7 +149,7 @@ class RallyCarEnv(TaskEnv):
     ## Start, end, success
 
     The car starts anywhere along the lap, near the middle (+-0.25 m, +-0.1 rad), at about 4 m/s with settled suspension
-    and turning wheels. The episode *terminates*, a failure, when any part of the car leaves the track of 3 m width, when
+    and turning wheels. The episode *terminates*, a failure, when any part of the car leaves the track (3 m wide), when
     it touches an obstacle, or when it turns over. It is *truncated* after T = 120 steps of 0.05 s, a success.
 
     ## Info (the same keys at reset and at every step)
@@ -164,8 +164,8 @@ class RallyCarEnv(TaskEnv):
     | `onset` | int | t0, -1 in an undisturbed episode, T until a placed disturbance comes into view |
 
     Parameters: mass [kg] and yaw_inertia [kg m^2] of the whole car, l_f and l_r from its centre of mass to the axles
-    [m], friction of the ground under the wheels (mean), steering_bias [rad], and of an obstacle obstacle_s and obstacle_e
-    (curvilinear) and obstacle_radius of a circle that covers it [m]; all 0 until it is in view.
+    [m], friction of the ground under the wheels (mean), steering_bias [rad], and of an obstacle obstacle_s and
+    obstacle_e (curvilinear) and obstacle_radius of a circle that covers it [m]; all 0 until it is in view.
 
     ## Arguments
 
@@ -416,7 +416,7 @@ def front_angles(delta: float) -> tuple[float, float]:
 
 
 def bicycle_angle(left: float, right: float) -> float:
-    """Angle of the bicycle's wheel [rad], the mean of what the left and the right one say; inverse of `front_angles`."""
+    """Angle of the bicycle's wheel [rad], a mean of what the left and the right one say; inverse of `front_angles`."""
     half = 0.5 * GAUGE / (FRONT + REAR)
     first, second = math.tan(left), math.tan(right)
     return math.atan(0.5 * (first / (1.0 + half * first) + second / (1.0 - half * second)))

@@ -1,7 +1,7 @@
 """Disturbances of the rally car.
 
-What is `placed` stands beside or on the track from the reset on, out of view, and sets in when the camera first sees it;
-the others set in at a step that is drawn. Kinds of `obstacle-held-out` never occur in `obstacle`.
+What is `placed` stands beside or on the track from the reset on, out of view, and sets in when the camera first sees
+it; the others set in at a step that is drawn. Kinds of `obstacle-held-out` never occur in `obstacle`.
 """
 
 from __future__ import annotations

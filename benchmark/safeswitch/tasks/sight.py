@@ -1,8 +1,8 @@
 """What the rally car's camera can see, without rendering: the frustum, and banks and tubes as occluders.
 
 A pixel of an object shows when a point of its surface lies within the camera's field of view and no bank or tube is
-between them. Points are sampled on the surface; rays of sight are MuJoCo's, on the very triangles that are drawn. The camera's
-pose is computed from the car's, so that the answer is a function of the state alone.
+between them. Points are sampled on the surface; rays of sight are MuJoCo's, on the very triangles that are drawn. The
+camera's pose is computed from the car's, so that the answer is a function of the state alone.
 """
 
 from __future__ import annotations
