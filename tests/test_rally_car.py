@@ -12,9 +12,10 @@ import pytest
 
 import safeswitch  # noqa: F401
 from safeswitch.handover.episode import NeverSwitch, run_episode
-from safeswitch.tasks import rally_car
+from safeswitch.tasks import car_geometry, rally_car
 from safeswitch.tasks.base import TaskEnv
-from safeswitch.tasks.rally_car import FRONT, GAUGE, REAR, WHEELS, RallyCarConfig, bicycle_angle, front_angles
+from safeswitch.tasks.car_geometry import FRONT, GAUGE, REAR, WHEELS, bicycle_angle, front_angles
+from safeswitch.tasks.rally_car_config import RallyCarConfig
 
 IMAGE, STATE = "SafeSwitch/RallyCarImage-v0", "SafeSwitch/RallyCar-v0"
 
@@ -106,8 +107,8 @@ def test_throttle_is_a_force() -> None:
     before = env.state[3]
     for _ in range(4):
         env.advance([0.0, 0.5])
-    spin = sum(float(env.simulator.nominal.body(name).inertia[1]) for name in WHEELS) / rally_car.TYRE_RADIUS**2
-    force = 0.5 * 4 * 2.4 / rally_car.TYRE_RADIUS
+    spin = sum(float(env.simulator.nominal.body(name).inertia[1]) for name in WHEELS) / car_geometry.TYRE_RADIUS**2
+    force = 0.5 * 4 * 2.4 / car_geometry.TYRE_RADIUS
     assert (env.state[3] - before) / 0.2 == pytest.approx(force / (env.parameters[0] + spin), rel=0.05)
 
 
@@ -159,7 +160,7 @@ def test_it_starts_with_settled_suspension_and_rolling_wheels() -> None:
 def test_the_whole_car_has_to_be_on_the_track(e_y: float) -> None:
     env = make()
     env.reset(seed=0, options={"initial_state": [0, e_y, 0, 4.0, 0, 0, 0]})
-    assert env.terminated == (abs(e_y) + rally_car.FOOTPRINT[2] > 1.5)  # the bend adds 2 cm at most
+    assert env.terminated == (abs(e_y) + car_geometry.FOOTPRINT[2] > 1.5)  # the bend adds 2 cm at most
     env.reset(seed=0, options={"initial_state": [0, 1.2 * np.sign(e_y), 1.2, 4.0, 0, 0, 0]})
     assert env.terminated == bool(e_y)  # at an angle, a corner is over the edge
 

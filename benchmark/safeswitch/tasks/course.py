@@ -153,7 +153,7 @@ def _strip_faces(count: int, width: int, flip: bool) -> NDArray[np.int64]:
 def _pieces(track: Track) -> Array:
     """Arc lengths (n,) at which the pieces of borders and banks meet [m]."""
     count = round(track.length / PIECE)
-    return np.arange(count) * (track.length / count)
+    return np.arange(count, dtype=np.float64) * (track.length / count)
 
 
 def _hang_backdrop(tree: Any) -> None:
@@ -233,7 +233,7 @@ def _offsets(track: Track) -> Array:
     left = np.cos(heading[nearest]) * towards[..., 1] - np.sin(heading[nearest]) * towards[..., 0]
     fine = (np.arange(PIXELS) + 0.5) * COARSE / PIXELS - 0.5
     signed = np.copysign(distance, left)
-    return map_coordinates(signed, np.meshgrid(fine, fine, indexing="ij"), order=1, mode="nearest")
+    return np.asarray(map_coordinates(signed, np.meshgrid(fine, fine, indexing="ij"), order=1, mode="nearest"))
 
 
 def backdrop_picture() -> NDArray[np.uint8]:
