@@ -30,8 +30,8 @@ from safeswitch.tasks.simulator import Simulator
 Array = NDArray[np.float64]
 
 HEADER = 5
-"""Leading numbers of a snapshot: episode seed, step index, consecutive good states, terminated, and the onset of what is
-placed (-1 until it is in view)."""
+"""Leading numbers of a snapshot: episode seed, step index, consecutive good states, terminated, and the onset of what
+is placed (-1 until it is in view)."""
 
 
 class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
