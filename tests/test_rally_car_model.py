@@ -163,7 +163,7 @@ def test_one_step_per_control_period_is_accurate_enough() -> None:
     for i in range(20):
         u = np.array([0.2 * np.sin(2 * np.pi * i / 20), 0.05])
         x, y = coarse(x, u, p).full().ravel(), fine(y, u, p).full()[:, -1]
-    assert np.abs(x - y)[:2].max() < 0.05
+    assert np.abs(x - y)[:2].max() < 0.1
 
 
 def test_bias_is_a_shift_of_the_target() -> None:
