@@ -1,8 +1,8 @@
 """What the rally car's expert can do: laps, the point of no return before an obstacle, milliseconds, and its model.
 
 `report` drives the MuJoCo car and writes, into one folder, ``laps.csv``, ``avoidance.csv``, ``timing.csv`` and
-``model.csv``, and the figure ``avoidance.png``: the share of obstacles that the expert still avoids against the distance
-at which it takes over from a lane keeper that is blind to them.
+``model.csv``, and the figure ``avoidance.png``: the share of obstacles that the expert still avoids against the
+distance at which it takes over from a lane keeper that is blind to them.
 """
 
 from __future__ import annotations

@@ -67,8 +67,7 @@ def record(env: RallyCarEnv, seeds: Sequence[int], seconds: float = SECONDS) -> 
         for start in range(0, len(actions) - steps, EVERY):  # without the last step: it may have left the track
             piece = np.array(states[start : start + steps + 1]), np.array(actions[start : start + steps])
             pieces.append((*piece, env.parameters))
-    states, actions, parameters = (np.stack(each) for each in zip(*pieces, strict=True))
-    return Drives(env.track, states, actions, parameters)
+    return Drives(env.track, *(np.stack(each) for each in zip(*pieces, strict=True)))
 
 
 def predict(drives: Drives, control_dt: float, car: Car, substeps: int = SUBSTEPS) -> Array:
