@@ -15,7 +15,7 @@ loads N_f, N_r and the lateral slip velocity w of a tyre,
 
 A tyre is linear in its slip, N / w_0, up to its limit mu N. Tyres are stiff (a time constant of hundredths of a second,
 shorter at low speed), so v_y and r are stepped implicitly with the tyres' secant stiffness: stable at any speed, exact
-in steady cornering, which becomes the kinematic bicycle as v_x -> 0. One such step serves a whole control period.
+in steady cornering, which becomes the kinematic bicycle as v_x -> 0. The expert plans in steps of a control period.
 
 Where the speed is held by a controller of the car's own, the expert plans with the first five states
 (`steering_only`): v_x is a parameter, and the wheels follow their target at once. That costs nothing in closed loop,
@@ -74,10 +74,10 @@ class Car:
         circle_radius: [m].
     """
 
-    slip_front: float = 0.15
-    slip_rear: float = 0.15
+    slip_front: float = 0.045
+    slip_rear: float = 0.076
     steering_lag: float = 0.05
-    drive: float = 3.94
+    drive: float = 3.98
     circles: tuple[float, float] = (0.28, -0.17)
     circle_radius: float = 0.34
 
@@ -125,9 +125,19 @@ def middle_curvature(symbols: Symbols, control_dt: float) -> ca.MX:
     return curvature(symbols.x[0] + 0.5 * control_dt * symbols.v_x, symbols.parameters)
 
 
-def dynamics(control_dt: float, steering_only: bool, car: Car) -> ca.Function:
-    """(x, u, p) -> x after `control_dt` [s]: implicit in v_y and r, midpoint for the pose."""
-    symbols, h = Symbols.make(steering_only), control_dt
+def dynamics(control_dt: float, steering_only: bool, car: Car, substeps: int = 1) -> ca.Function:
+    """(x, u, p) -> x after `control_dt` [s] of constant controls, in `substeps` steps."""
+    symbols = Symbols.make(steering_only)
+    x, u, p = symbols.x, symbols.u, symbols.p
+    step, end = _step(control_dt / substeps, steering_only, car), x
+    for _ in range(substeps):
+        end = step(end, u, p)
+    return ca.Function("rally_car_dynamics", [x, u, p], [end], ["x", "u", "p"], ["x_next"])
+
+
+def _step(h: float, steering_only: bool, car: Car) -> ca.Function:
+    """(x, u, p) -> x after `h` [s]: implicit in v_y and r, midpoint for the pose."""
+    symbols = Symbols.make(steering_only)
     p, v_x = symbols.parameters, symbols.v_x
     s, e_y, e_psi, v_y, r = ca.vertsplit(symbols.x)[:5]
     target = symbols.u[0] + p["steering_bias"]
@@ -137,7 +147,7 @@ def dynamics(control_dt: float, steering_only: bool, car: Car) -> ca.Function:
     else:
         delta = symbols.x[5]
         new_delta = delta + (1 - np.exp(-h / car.steering_lag)) * (target - delta)
-        new_v_y, new_r, brake = _lateral(p, v_x, v_y, r, 0.5 * (delta + new_delta), h, car)
+        new_v_y, new_r, brake = _lateral(p, v_x, v_y, r, new_delta, h, car)
         new_v_x = v_x + h * (car.drive * symbols.u[1] - brake + 0.5 * (v_y + new_v_y) * 0.5 * (r + new_r))
         rest = [new_delta, new_v_x]
         v_x = 0.5 * (v_x + new_v_x)
@@ -149,11 +159,7 @@ def dynamics(control_dt: float, steering_only: bool, car: Car) -> ca.Function:
     e_dot = v_x * ca.sin(psi) + v * ca.cos(psi)
     pose = [s + h * s_dot, e_y + h * e_dot, e_psi + h * (w - kappa * s_dot)]
     return ca.Function(
-        "rally_car_dynamics",
-        [symbols.x, symbols.u, symbols.p],
-        [ca.vertcat(*pose, new_v_y, new_r, *rest)],
-        ["x", "u", "p"],
-        ["x_next"],
+        "rally_car_step", [symbols.x, symbols.u, symbols.p], [ca.vertcat(*pose, new_v_y, new_r, *rest)]
     )
 
 
