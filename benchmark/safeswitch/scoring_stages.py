@@ -31,15 +31,17 @@ if TYPE_CHECKING:
 SHOWN_CHUNKS = 1
 """Chunks of undisturbed episodes (1,600 states) on which a disturbance that is only seen is shown to the signals."""
 
+OTHERS = "other disturbances"
+"""`calibrated_on` of the rows that leave the cell's disturbance out."""
+
 
 def episodes_job(store: Store, task: Task, cell: Cell, trained: Trained, tables: CellTables, give_back: bool) -> Job:
     """Calibrate every method and score it on the test episodes of one (learner, cell), under both armings."""
     ids = methods(task.signals)
     settings = {"cell": str(cell), "learner_seed": trained.seed, "methods": list(ids), "give_back": give_back}
-    keys = [*tables.calibrate, *tables.calibrate_nominal, *tables.test, *tables.test_nominal]
     rules = {source_of("method", name.partition("@")[0]) for name in ids}
     code = ["safeswitch.handover.panel", "safeswitch.scoring.rows", *sorted(rules)]
-    key = store.key("episodes", settings, [*trained.keys, *keys], code)
+    key = store.key("episodes", settings, [*trained.keys, *tables.keys], code)
     arguments = (str(store.root), task, cell, trained, tables, give_back)
     return Job("episodes", f"{cell} learner {trained.seed}", key, _score_episodes, arguments)
 
@@ -54,6 +56,8 @@ def _score_episodes(
     give_back: bool,
 ) -> None:
     loaded = tables.load(Store(Path(root)), task, cell)
+    others = tables.load_others(Store(Path(root)), task)
+    own = "" if task.calibrated_on(cell) == cell else str(task.calibrated_on(cell))
     frames, logs = [], {}
     for protocol in protocols_of(cell):
         test = test_panel(loaded, cell, protocol)
@@ -63,16 +67,38 @@ def _score_episodes(
             if not method.latched and not give_back:
                 continue
             calibrated = method.calibrate(calibration)
+            if calibrated.rule is None:
+                continue
             if method.latched:
                 rows = latched_rows(test, calibrated)
             else:
-                rows = _plain_rows(task, cell, trained, test, calibrated.rule)
-            on = "" if task.calibrated_on(cell) == cell else str(task.calibrated_on(cell))
-            frames.append(labelled(rows, cell, protocol, method_id, trained.seed, calibrated, on))
+                rows = _plain_rows(task, cell, trained, test, method, calibrated.rule)
+            frames.append(labelled(rows, cell, protocol, method_id, trained.seed, calibrated, own))
             logs.update({f"{protocol}|{method_id}|{name}": value for name, value in calibrated.log.items()})
+        if others is not None:
+            left_out = Calibration(
+                _panel(others, loaded["calibrate_nominal"], cell, protocol),
+                loaded["calibrate_nominal"],
+                seed=trained.seed,
+            )
+            frames += _left_out_rows(task, cell, trained, test, left_out)
     save_frame(folder / "episodes.npz", concat(frames))
     save_arrays(folder / "logs.npz", **logs)
     loaded["test"].save(folder / "test.npz", snapshots=False)
+
+
+def _left_out_rows(
+    task: Task, cell: Cell, trained: Trained, test: Panel, calibration: Calibration
+) -> list[pd.DataFrame]:
+    """Rows of the latched methods that learn from disturbed episodes, calibrated on those of other disturbances."""
+    frames = []
+    for method in map(registry.make_method, methods(task.signals)):
+        learns = method.needs & {"failures", "rollouts"} and "privileged" not in method.needs
+        calibrated = method.calibrate(calibration) if learns and method.latched else None
+        if calibrated is not None and calibrated.rule is not None:
+            rows = latched_rows(test, calibrated)
+            frames.append(labelled(rows, cell, test.arming, method.id, trained.seed, calibrated, OTHERS))
+    return frames
 
 
 def protocols_of(cell: Cell) -> tuple[Arming, ...]:
@@ -100,14 +126,17 @@ def _panel(table: HandoverTable, nominal: HandoverTable, cell: Cell, protocol: A
     return Panel(concatenate([table, nominal]) if protocol == "start" else table, protocol)
 
 
-def _plain_rows(task: Task, cell: Cell, trained: Trained, test: Panel, rule: Any) -> pd.DataFrame:
+def _plain_rows(
+    task: Task, cell: Cell, trained: Trained, test: Panel, method: Method, rule: Any
+) -> pd.DataFrame:
     """Rules that give control back have no table: drive the same episodes."""
     driver, signals = trained.learner(task), trained.signals(task)
     envs = {True: make_env(task, cell), False: make_env(task, task.none_cell)}
     experts = {kind: env.make_expert() for kind, env in envs.items()}
+    advisers = {kind: env.make_expert() if "expert-queries" in method.needs else None for kind, env in envs.items()}
     episodes = [
-        run_episode(envs[bool(kind)], driver, signals, rule, experts[bool(kind)], int(seed), test.arming)
-        for seed, kind in zip(test.table.seeds, test.table.disturbed, strict=True)
+        run_episode(envs[kind], driver, signals, rule, experts[kind], seed, test.arming, adviser=advisers[kind])
+        for seed, kind in zip(test.table.seeds.tolist(), test.table.disturbed.tolist(), strict=True)
     ]
     for env in envs.values():
         env.close()
