@@ -18,6 +18,7 @@ from safeswitch.handover.panel import Calibration, Panel
 from safeswitch.handover.shown import shown_traces
 from safeswitch.handover.table import HandoverTable, concatenate
 from safeswitch.protocols import ARMINGS, Arming
+from safeswitch.scoring.metrics import OTHERS
 from safeswitch.scoring.rows import episode_rows, latched_rows
 from safeswitch.scoring.signal_quality import SignalQuality, frame_quality, signal_quality
 from safeswitch.stages import CellTables, Job, concat, load_table, make_env, only_seen, recorded_table, source_of
@@ -30,9 +31,6 @@ if TYPE_CHECKING:
 
 SHOWN_CHUNKS = 1
 """Chunks of undisturbed episodes (1,600 states) on which a disturbance that is only seen is shown to the signals."""
-
-OTHERS = "other disturbances"
-"""`calibrated_on` of the rows that leave the cell's disturbance out."""
 
 
 def episodes_job(store: Store, task: Task, cell: Cell, trained: Trained, tables: CellTables, give_back: bool) -> Job:

@@ -2,8 +2,8 @@
 
     conformal        one constant threshold      split conformal prediction on episode maxima
                                                  Vovk, Gammerman, Shafer 2005; Angelopoulos and Bates, arXiv 2107.07511
-    conformal-band   one threshold per step      functional conformal band: Diquigiovanni, Fontana, Vantini,
-                                                 arXiv 2102.06746, as in FAIL-Detect: Xu et al. 2025, arXiv 2503.08558
+    conformal-band   one threshold per step      functional conformal band: Diquigiovanni, Fontana, Vantini, The
+                                                 importance of being a band; FAIL-Detect: Xu et al., arXiv 2503.08558
     patience         a run of high values        Diff-DAgger: Lee, Kang, Kuo 2024, arXiv 2410.14868
 
 None needs a failure or an expert. All are latched, and all call an alarm at the step after which they hand over.

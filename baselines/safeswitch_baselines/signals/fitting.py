@@ -1,4 +1,4 @@
-"""What fitted signals learn from training features: covariances, principal axes, regressions, classifiers, distillation.
+"""What fitted signals learn from training features: covariances, axes, regressions, classifiers, distillation.
 
 Everything runs on one torch thread, in double precision where matrices are factorised, in memory that torch aligned:
 the same arguments give the same bits.
