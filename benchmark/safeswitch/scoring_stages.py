@@ -9,6 +9,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pandas as pd
 
 from safeswitch import registry
@@ -54,7 +55,7 @@ def _score_episodes(
     give_back: bool,
 ) -> None:
     loaded = tables.load(Store(Path(root)), task, cell)
-    others = tables.load_others(Store(Path(root)), task)
+    others = tables.load_others(Store(Path(root)))
     own = "" if task.calibrated_on(cell) == cell else str(task.calibrated_on(cell))
     frames, logs = [], {}
     for protocol in protocols_of(cell):
@@ -74,11 +75,9 @@ def _score_episodes(
             frames.append(labelled(rows, cell, protocol, method_id, trained.seed, calibrated, own))
             logs.update({f"{protocol}|{method_id}|{name}": value for name, value in calibrated.log.items()})
         if others is not None:
-            left_out = Calibration(
-                _panel(others, loaded["calibrate_nominal"], cell, protocol),
-                loaded["calibrate_nominal"],
-                seed=trained.seed,
-            )
+            nominal = loaded["calibrate_nominal"]
+            twins = nominal.take(np.tile(np.arange(len(nominal)), len(others) // len(nominal)))
+            left_out = Calibration(_panel(others, twins, cell, protocol), nominal, seed=trained.seed)
             frames += _left_out_rows(task, cell, trained, test, left_out)
     save_frame(folder / "episodes.npz", concat(frames))
     save_arrays(folder / "logs.npz", **logs)

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
-import numpy as np
 import pandas as pd
 
 from safeswitch import demos, registry
@@ -218,13 +217,10 @@ class CellTables:
         others = [key for _, keys in self.others for key in keys]
         return [*self.calibrate, *self.calibrate_nominal, *self.test, *self.test_nominal, *others]
 
-    def load_others(self, store: Store, task: Task) -> HandoverTable | None:
-        """As many calibrate episodes as one cell has, of the other disturbances in turn, seed by seed; None without."""
-        if not self.others:
-            return None
-        tables = [load_table(store, task, cell, keys) for cell, keys in self.others]
-        index = np.arange(len(tables[0]))
-        return concatenate([table.take(index[turn :: len(tables)]) for turn, table in enumerate(tables)])
+    def load_others(self, store: Store) -> HandoverTable | None:
+        """The calibrate episodes of every other disturbance; None without."""
+        tables = [recorded_table(store, keys) for _, keys in self.others]  # complete: they need no simulator
+        return concatenate(tables) if tables else None
 
     def load(self, store: Store, task: Task, cell: Cell) -> dict[str, HandoverTable]:
         """Each table by the name of its attribute; tables of the same episodes are one object."""

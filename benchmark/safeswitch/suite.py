@@ -254,7 +254,8 @@ CEM_VARIANTS = ("cem-literal@total", "cem-single@total", "cem-high@total", "cem-
 MONITORS = ("conformal", "conformal-band", "patience")
 MATCHED = tuple(f"share-{share}" for share in SHARES)
 PER_SIGNAL = ("cem", "grid", "random-search", *QUANTILES, *MONITORS, *MATCHED, "best")
-GIVE_BACK = ("cem-two@total", "safe-dagger@discrepancy", "lazy@discrepancy")
+OURS = ("cem-vector", "cem-vector-return")
+GIVE_BACK = ("cem-two@total", "cem-two@epistemic", "safe-dagger@discrepancy", "lazy@discrepancy")
 DOUBTS = ("epistemic", "ensemble")
 """Signals that are a doubt in the sense of EnsembleDAgger and a novelty in that of ThriftyDAgger."""
 
@@ -263,8 +264,8 @@ def methods(signals: tuple[str, ...]) -> tuple[str, ...]:
     """Every method of the comparison on these signals."""
     doubts = tuple(signal for signal in DOUBTS if signal in signals)
     give_back = [method for method in GIVE_BACK if method.partition("@")[2] in signals]
-    give_back += _methods(doubts, ("cem-two", "ensemble-dagger", "thrifty"))
-    return (*BOUNDS, *CONTROLS, *VALUES, *CEM_VARIANTS, *_methods(signals, PER_SIGNAL), *give_back)
+    give_back += _methods(doubts, ("ensemble-dagger", "thrifty"))
+    return (*BOUNDS, *CONTROLS, *VALUES, *CEM_VARIANTS, *OURS, *_methods(signals, PER_SIGNAL), *give_back)
 
 
 @dataclass(frozen=True)

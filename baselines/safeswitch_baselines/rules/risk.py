@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from safeswitch.handover.panel import Panel
+from safeswitch.handover.table import Bools
 from safeswitch.protocols import Array
 
 SMALLEST = 1e-6
@@ -68,10 +69,10 @@ class RiskCritic:
         return {"mean": self.mean, "scale": self.scale, "weights": np.append(self.weights, self.bias)}
 
 
-def _regressors(panel: Panel, names: tuple[str, ...]) -> tuple[Array, np.ndarray]:
+def _regressors(panel: Panel, names: tuple[str, ...]) -> tuple[Array, Bools]:
     """(E, T, n) regressors, and (E, T) where they are known."""
     traces = [panel.signal(name) for name in names]
-    known = ~np.isnan(traces).any(axis=0)
+    known = ~np.isnan(np.stack(traces)).any(axis=0)
     time = np.broadcast_to(np.arange(panel.table.horizon) / panel.table.horizon, known.shape)
     logs = [np.log(np.maximum(np.where(known, trace, 1.0), SMALLEST)) for trace in traces]
     return np.stack([*logs, time], axis=-1), known
