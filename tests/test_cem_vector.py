@@ -30,10 +30,10 @@ EDGE = 0.12
 
 
 def hidden_cliff(seed: int, disturbed: bool) -> HandoverTable:
-    """A cliff whose signal is hidden below a swing that all episodes share, beside a signal that says nothing."""
+    """A cliff after a swing-up, in which the signal of every episode is higher, beside a signal that says nothing."""
     table = cliff_table(EDGE, 40, disturbed, seed)
     rng = np.random.default_rng(seed + 1)
-    swing = np.exp(2.5 * np.sin(np.arange(80) / 6.0) ** 2)
+    swing = np.where(np.arange(80) < 8, 55.0, 1.0)  # over before the first onset
     noise = np.exp(0.5 * rng.standard_normal((40, 80)))
     return table.with_signal("total", table.signals["total"] * swing).with_signal("epistemic", noise)
 
@@ -49,7 +49,7 @@ def test_the_search_scores_what_an_episode_does(arming: Any) -> None:
     baseline, panel = Baseline.fit(chosen.nominal), chosen.panel.take(np.arange(20, 60) % len(chosen.panel))
     points = np.random.default_rng(0).normal([0.0, 0.0, 0.5, -0.5, 0.0, 2.0], 1.0, (12, 6))
     found = alarms(panel, baseline.standardised(panel), points)
-    assert 0.1 < np.mean(found < panel.table.horizon) < 0.99
+    assert len(np.unique(found)) > 20
     for point, expected in zip(points, found, strict=True):
         rule = VectorRule(Score(baseline, Parameters.of(point), panel.table.horizon))
         np.testing.assert_array_equal(panel.handover_of(rule), expected)
@@ -61,7 +61,7 @@ def test_it_spends_no_more_than_cem(arming: Any) -> None:
     assert CEMVector().calibrate(chosen).tuning_episodes <= CEM("total").calibrate(chosen).tuning_episodes
 
 
-def test_it_finds_what_is_hidden_below_a_swing_that_all_episodes_share() -> None:
+def test_it_finds_what_is_hidden_below_the_swing_up_that_all_episodes_share() -> None:
     test = hidden("start", seed=7).panel
     earned = {
         name: test.returns(test.handover_of(registry.make_method(name).calibrate(hidden("start")).rule)).mean()

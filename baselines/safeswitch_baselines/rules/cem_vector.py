@@ -49,7 +49,8 @@ class Settings:
         candidates: drawn per iteration.
         elites: how many of the best refit the distribution.
         iterations: of the search.
-        episodes: shared by the candidates of an iteration; 2 x under `start`, half of them undisturbed.
+        episodes: shared by the candidates of an iteration; 2 x under `start`, half of them
+            undisturbed. Few candidates on many episodes generalise better than the reverse.
         smoothing: weight of the refit against the value of before.
         floor: smallest standard deviation of every parameter.
         average: the result is the mean of this many last iterations.
@@ -58,10 +59,10 @@ class Settings:
         blend: initial mean of logit b.
     """
 
-    candidates: int = 32
-    elites: int = 8
+    candidates: int = 16
+    elites: int = 4
     iterations: int = 10
-    episodes: int = 32
+    episodes: int = 64
     smoothing: float = 0.5
     floor: float = 0.3
     average: int = 3
@@ -248,7 +249,7 @@ class CEMVector(PlainMethod):
     """`cem-vector`: latched; weights, normalisation, smoothing and threshold by CEM on the exact table.
 
     It reads every unsmoothed signal that the task records. Decision: alarm where the module's score is above theta.
-    Calibration: 10 iterations of 32 candidates on 32 calibrate episodes, 64 under `start`: the number of episodes that
+    Calibration: 10 iterations of 16 candidates on 64 calibrate episodes, 128 under `start`: the number of episodes that
     `cem@` spends without repetitions. The baseline comes from undisturbed calibrate episodes.
     """
 
