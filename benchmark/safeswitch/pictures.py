@@ -18,6 +18,7 @@ from safeswitch.handover.table import HandoverTable
 from safeswitch.protocols import Arming, Expert
 from safeswitch.scoring import episode_figures, figures
 from safeswitch.scoring.leaderboard import read_csv
+from safeswitch.scoring.metrics import OTHERS
 from safeswitch.scoring.style import Marks
 from safeswitch.scoring.video import HEIGHT, Trace, observations, replay_frames, sees_images, write_side_by_side
 from safeswitch.store import Store
@@ -53,9 +54,9 @@ def draw(folder: Path, root: str, task: Task, trained: Trained, episodes: str, t
     target = folder / "figures"
     target.mkdir(parents=True)
     loaded = tables.load(store, task, cell)
-    rows = load_frame(store.folder(episodes) / "episodes.npz")
+    rows = _own(load_frame(store.folder(episodes) / "episodes.npz"))
     logs = load_arrays(store.folder(episodes) / "logs.npz")
-    table = read_csv(store.folder(scores) / "leaderboard.csv")
+    table = _own(read_csv(store.folder(scores) / "leaderboard.csv"))
     for protocol in scoring_stages.protocols_of(cell):
         calibration = scoring_stages.calibration_of(loaded, task, cell, protocol, seed=0)
         for signal in drawn_signals(task):
@@ -69,6 +70,11 @@ def draw(folder: Path, root: str, task: Task, trained: Trained, episodes: str, t
     _draw_episode(story, rows, target)
     _draw_film(story, target)
     _draw_disturbances(task, target)
+
+
+def _own(rows: pd.DataFrame) -> pd.DataFrame:
+    """Without the rows that leave a disturbance out: figures are of one cell and its own calibration."""
+    return rows[rows["calibrated_on"] != OTHERS]
 
 
 def drawn_signals(task: Task) -> tuple[str, ...]:
