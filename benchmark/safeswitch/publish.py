@@ -155,7 +155,7 @@ def _write_tables(run: Run, folder: Path) -> None:
     for job in run.episodes:
         cell, trained = job.arguments[2], job.arguments[3]
         if cell in run.task.cells[:3]:
-            target = folder / f"{cell.disturbance}-{cell.severity}-learner{trained.seed}.npz"
+            target = folder / f"{cell.label}-{cell.severity}-learner{trained.seed}.npz"
             shutil.copyfile(run.store.folder(job.key) / "test.npz", target)
 
 

@@ -63,7 +63,7 @@ def _score_episodes(
         calibration = calibration_of(loaded, task, cell, protocol, trained.seed)
         for method_id in methods(task.signals):
             method: Method = registry.make_method(method_id)
-            if not method.latched and not give_back:
+            if not method.latched and not (give_back and protocol == "start"):
                 continue
             calibrated = method.calibrate(calibration)
             if calibrated.rule is None:
@@ -127,8 +127,8 @@ def _plain_rows(
     task: Task, cell: Cell, trained: Trained, test: Panel, method: Method, rule: Any
 ) -> pd.DataFrame:
     """Rules that give control back have no table: drive the same episodes."""
-    driver, signals = trained.learner(task), trained.signals(task)
-    envs = {True: make_env(task, cell), False: make_env(task, task.none_cell)}
+    driver, signals = trained.learner(task), trained.signals(task, getattr(rule, "reads", None))
+    envs = {True: make_env(task, cell), False: make_env(task, task.undisturbed(cell))}
     experts = {kind: env.make_expert() for kind, env in envs.items()}
     advisers = {kind: env.make_expert() if "expert-queries" in method.needs else None for kind, env in envs.items()}
     episodes = [
@@ -146,7 +146,7 @@ def labelled(
     """Rows of `scoring.rows` with the columns that say what they are rows of."""
     return rows.assign(
         task=cell.task,
-        disturbance=cell.disturbance,
+        disturbance=cell.label,
         severity=cell.severity,
         protocol=protocol,
         method=method_id,
@@ -206,6 +206,6 @@ def _score_signals(
             by_signal[signal] = replace(frames, episode_auroc=before.episode_auroc)
     rows = [{"signal": signal, **asdict(quality)} for signal, quality in by_signal.items()]
     frame = pd.DataFrame(rows).assign(
-        task=cell.task, disturbance=cell.disturbance, severity=cell.severity, learner=trained.seed
+        task=cell.task, disturbance=cell.label, severity=cell.severity, learner=trained.seed
     )
     save_frame(folder / "signals.npz", frame)
