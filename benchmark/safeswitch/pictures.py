@@ -285,11 +285,10 @@ def _sheet_frames(task: Task, cell: Cell, expert: Expert, seed: int) -> list[NDA
     env = stages.make_env(task, cell)
     env.reset(seed=seed)
     expert.reset()
-    wanted = [(env.onset or 0) + step for step in SHEET_STEPS]
     seen: dict[int, NDArray[np.uint8]] = {}
-    while not env.done and env.step_index <= wanted[-1]:
-        if env.step_index in wanted:
-            seen[env.step_index] = env.observe()
+    # The onset may be the first step at which something is in view, and is known only then.
+    while not env.done and env.step_index <= (env.onset or 0) + SHEET_STEPS[-1]:
+        seen[env.step_index] = env.observe()
         env.advance(expert.action(env.state, env.parameters))
     env.close()
-    return [seen.get(step) for step in wanted]
+    return [seen.get((env.onset or 0) + step) for step in SHEET_STEPS]

@@ -236,7 +236,7 @@ class CellTables:
 
 def only_seen(cell: Cell) -> bool:
     """Whether the disturbance changes nothing but the picture: the same state can then be seen without it."""
-    from safeswitch.tasks import visual  # noqa: F401  (registers the disturbances of images)
+    from safeswitch.tasks import rally_disturbances, rally_visual, visual  # noqa: F401  (register disturbances)
     from safeswitch.tasks.disturbances import DISTURBANCES  # imports mujoco
 
     return cell.tag != "none" and DISTURBANCES[cell.disturbance].only_seen

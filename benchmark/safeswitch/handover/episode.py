@@ -32,7 +32,7 @@ class Episode:
 
     Attributes:
         seed: episode seed.
-        onset: step t0 of the disturbance, -1 when undisturbed.
+        onset: step t0 of the disturbance, -1 when undisturbed; T when the disturbance never came into view.
         arming_step: first step at which the rule was asked.
         length: steps executed; < T after an early failure.
         success: the task's criterion at the end.
@@ -98,7 +98,7 @@ class NeverSwitch:
 
 
 def arming_step(onset: int | None, arming: Arming, horizon: int) -> int:
-    """First step at which the monitor is on: t0 under `onset` (T, i.e. never, when undisturbed), 0 under `start`."""
+    """First step at which the monitor is on: t0 under `onset` (T, that is never, undisturbed), 0 under `start`."""
     if arming == "start":
         return 0
     if arming == "onset":
@@ -137,8 +137,6 @@ def run_episode(
     for signal in signals:
         signal.reset()
     horizon = env.horizon
-    onset = -1 if env.onset is None else int(env.onset)
-    armed_from = arming_step(env.onset, arming, horizon)
     driven = np.full(horizon, -1, np.int8)
     actions = np.full((horizon, *env.simulator.action_shape), np.nan)
     states = np.full((horizon + 1, env.state.size), np.nan)
@@ -151,6 +149,7 @@ def run_episode(
         observation = env.observe()
         prediction = learner.predict(observation, step)
         values = {signal.id: signal.update(observation, prediction, previous) for signal in signals}
+        armed_from = arming_step(env.onset, arming, horizon)  # of a placed disturbance: T until it is in view
         if step == armed_from:
             driver = Driver(rule.arm(step))
         action = _expert_action(env, expert, driven, step) if driver is Driver.EXPERT else prediction.action
@@ -170,6 +169,8 @@ def run_episode(
             driver = Driver(rule.update(step, values))
         previous = actions[step]
     length = env.step_index
+    onset = -1 if env.onset is None else env.onset
+    armed_from = arming_step(env.onset, arming, horizon)
     return Episode(
         seed, onset, armed_from, length, env.is_success, driven, actions, states, traces, _stack(snapshots, horizon)
     )

@@ -120,7 +120,7 @@ def _check_ranges(frame: pd.DataFrame, infos: Mapping[str, TaskInfo]) -> None:
         "0 <= learner_steps <= T": frame["learner_steps"].between(0, horizon),
         "0 <= armed_learner_steps <= learner_steps": frame["armed_learner_steps"].between(0, frame["learner_steps"]),
         "onset >= 0 where disturbed and -1 elsewhere": (frame["onset"] >= 0) == frame["disturbed"],
-        "onset < T": frame["onset"] < horizon,
+        "onset <= T": frame["onset"] <= horizon,
         "protocol 'onset' has disturbed episodes only": (frame["protocol"] != "onset") | frame["disturbed"],
     }
     for law, holds in laws.items():
