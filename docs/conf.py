@@ -52,14 +52,32 @@ nitpick_ignore_regex = [
 
 def _plain(app: Any, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
     """Escape what reStructuredText takes for markup in a docstring that is plain text, outside of literal text."""
+    if any(line.startswith("## ") for line in lines):  # written in Markdown, with tables: shown as it is
+        body = lines.index("") if "" in lines else len(lines)
+        lines[body:] = ["", ".. code-block:: text", "", *(f"   {line}" for line in lines[body:]), ""]
+        return
+    if what == "module":
+        lines[:] = _literal_blocks(lines)
     for i, line in enumerate(lines):
         field = re.match(r"\s*(:[^:]*:|\.\.|\* )?", line)
         start, rest = line[: field.end()], line[field.end() :]  # type: ignore[union-attr]
-        if start.strip() == "..":
+        if start.strip() == ".." or (what == "module" and line.startswith("    ")):
             continue
         parts = re.split(r"(``.*?``|`[^`]*`|:\w+:`[^`]*`)", rest)
         parts[::2] = [re.sub(r"([*|])|(?<=\w)(_)(?=\W|$)", r"\\\g<0>", part) for part in parts[::2]]
         lines[i] = start + "".join(parts)
+
+
+def _literal_blocks(lines: list[str]) -> list[str]:
+    """The same with `::` before blocks that are set off by an indentation: formulas and tables of modules."""
+    found: list[str] = []
+    for line in lines:
+        last = next((each for each in reversed(found) if each.strip()), "")
+        inside = last.startswith("    ") or last.rstrip().endswith("::") or last.startswith(("* ", "- "))
+        if line.startswith("    ") and not inside and found and not found[-1].strip():
+            found += ["::", ""]
+        found.append(line)
+    return found
 
 
 def _outside(app: Any, docname: str, source: list[str]) -> None:

@@ -21,6 +21,7 @@ from rich.console import Console
 from micro import MICRO, TASK
 from safeswitch import cli, console, durations, pipeline, suite
 from safeswitch.console import Progress, StageError
+from safeswitch.files import load_json
 from safeswitch.interrupts import for_this_process_alone
 from safeswitch.pipeline import STAGES, Run
 from safeswitch.scoring.leaderboard import read_csv
@@ -167,9 +168,9 @@ def test_durations_are_readable(seconds: float, text: str) -> None:
 
 
 def test_shipped_durations_are_of_stages_that_exist() -> None:
-    for task, profiles in durations.load_json(durations.SHIPPED).items():
+    for task, profiles in load_json(durations.SHIPPED).items():
         for profile, stages in profiles.items():
-            assert set(stages) == set(Run(suite.task(task), suite.profile(profile), Store("unused")).stages)
+            assert set(stages) <= set(Run(suite.task(task), suite.profile(profile), Store("unused")).stages)
 
 
 def test_a_guess_comes_from_the_last_run_in_the_folder_if_it_was_alike(tmp_path: Path) -> None:
