@@ -181,7 +181,7 @@ RALLY_LEARNER: Mapping[str, Any] = {
     "feature_dropout": 0.2,
     "hidden_dropout": (0.3, 0.0),
     "components": 64,
-    "excess_gain": 40.0,
+    "excess_gain": 100.0,
     "warmup_epochs": 2,
     "epochs": 6,
     "batch_size": 32,
