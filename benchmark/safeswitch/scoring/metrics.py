@@ -23,6 +23,8 @@ OTHER_PREVALENCES = (0.1, 0.9)
 """Shares of disturbed episodes to which the half-and-half `start` returns are re-weighted."""
 REFERENCES = ("learner", "expert", "timer")
 """The methods whose best return is the zero of skill, R0."""
+OTHERS = "other disturbances"
+"""`calibrated_on` of the rows whose threshold has not seen the disturbance that it is tested on."""
 MIN_CONTEST = 0.1
 """Below this distance between R0 and the hindsight best a cell is no contest and has no skill."""
 

@@ -4,9 +4,9 @@ An episode is a function of its seed. Three named streams feed it, `initial-stat
 undisturbed twin (same seed, ``disturbance=None``) starts in the same state and is identical until the onset step t0.
 
 The disturbance sets in before the observation of step t0: from there on the simulator steps with its disturbed model.
-t0 is drawn, and which model is in force is a function of the step index alone. A `placed` disturbance is different: it
-stands somewhere in the world from the reset on, and t0 is the first step at which the trajectory at hand shows it. Until
-then nothing that is observed, and no parameter, tells of it; a snapshot remembers whether it has been seen.
+t0 is drawn, and which model is in force is a function of the step index alone. A `placed` disturbance is different:
+it stands in the world from the reset on, and t0 is the first step at which the trajectory at hand shows it. Until then
+nothing that is observed, and no parameter, tells of it; a snapshot remembers whether it has been seen.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from safeswitch.protocols import Expert
 from safeswitch.seeding import stream
-from safeswitch.tasks import checks, rally_disturbances, visual  # noqa: F401  (they register disturbances)
+from safeswitch.tasks import checks, rally_disturbances, rally_visual, visual  # noqa: F401  (register disturbances)
 from safeswitch.tasks.disturbances import Disturbance, make_disturbance
 from safeswitch.tasks.rendering import Image, Renderer
 from safeswitch.tasks.simulator import Simulator
@@ -30,7 +30,8 @@ from safeswitch.tasks.simulator import Simulator
 Array = NDArray[np.float64]
 
 HEADER = 5
-"""Leading numbers of a snapshot: episode seed, step index, consecutive good states, terminated, onset (-1: none)."""
+"""Leading numbers of a snapshot: episode seed, step index, consecutive good states, terminated, and the onset of what
+is placed (-1 until it is in view)."""
 
 
 class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
@@ -287,7 +288,7 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
     def snapshot(self) -> Array:
         """Everything that the rest of the episode depends on, besides its seed and options, as one vector."""
         snapshot = np.empty(HEADER + self.simulator.state_size)
-        onset = -1 if self._onset is None else self._onset
+        onset = self._onset if self._placed and self._onset is not None else -1  # a drawn one follows from the seed
         snapshot[:HEADER] = (self._seed_key(), self._step_index, self._good_steps, self._terminated, onset)
         self.simulator.read(snapshot[HEADER:])
         return snapshot
@@ -346,9 +347,8 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
             return
         if self._placed:
             if given_onset is not None:
-                raise ValueError(
-                    f"the onset of {self.disturbance.name!r} is the first step at which it is in view: it cannot be given"
-                )
+                name = self.disturbance.name  # type: ignore[union-attr]
+                raise ValueError(f"the onset of {name!r} is the first step at which it is in view: it cannot be given")
             self._onset = None
         else:
             drawn = self._draw_onset(stream(seed, "onset"))

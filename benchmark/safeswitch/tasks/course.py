@@ -36,8 +36,8 @@ PIECE = 0.5
 """Length of the pieces of tubes and banks along the track [m]."""
 BANK: tuple[tuple[float, float], ...] = ((0.20, -0.02), (0.65, 0.62), (0.85, 0.75), (1.05, 0.62), (1.55, -0.02))
 """Cross-section of a bank: distance beyond the edge, height [m]. A lens 0.30 m high sees nothing behind it."""
-BANK_GROUP = 2
-"""Geom group of the banks, by which rays of sight find them."""
+HIDING_GROUP = 2
+"""Geom group of banks and tubes, by which rays of sight find them."""
 BACKDROP_HEIGHT = 14.0
 """[m]: fills the onboard camera's view above the horizon from anywhere on the track."""
 BACKDROP = (128, 512)
@@ -54,7 +54,10 @@ SKY_LOW, SKY_HIGH, HILLS, TREES = (
 
 @lru_cache(maxsize=8)
 def rally_car(track: Track, timestep: float, actions: int) -> mujoco.MjModel:
-    """Compiled car on `track`, with room for an action of some numbers. Shared within the process: copy it before changing it."""
+    """Compiled car on `track`, with room for an action of `actions` numbers.
+
+    Shared within the process: copy it before changing it.
+    """
     tree = models.compose("rally_car/rally_car.xml")
     tree.include_copy(models.part("rally_car/course.xml"))
     tree.option.timestep = timestep
@@ -62,7 +65,7 @@ def rally_car(track: Track, timestep: float, actions: int) -> mujoco.MjModel:
     tree.statistic.extent = 1.0  # near and far plane are then in metres
     tree.statistic.center = [0.0, 0.0, 0.0]
     tree.visual.map.zfar = 70.0
-    tree.visual.map.shadowclip = 3.0
+    tree.visual.map.shadowclip = 2.0
     tree.visual.quality.shadowsize = 2048
     _lay_ground(tree)
     _build_tubes(tree, track)
@@ -93,13 +96,13 @@ def _build_tubes(tree: Any, track: Track) -> None:
     material = tree.asset.add("material", name="tube", rgba=[0.06, 0.06, 0.07, 1.0], specular=0.4, shininess=0.4)
     angles = np.linspace(math.radians(210), math.radians(-30), 6)  # open where it lies on the ground
     section = [(TUBE_OFFSET + TUBE_RADIUS * math.cos(a), TUBE_RADIUS * (0.5 + math.sin(a))) for a in angles]
-    _build_along(tree, track, "tube", material, section, group=1)
+    _build_along(tree, track, "tube", material, section)
 
 
 def _build_banks(tree: Any, track: Track) -> None:
     """An earth bank behind either tube."""
     material = tree.asset.add("material", name="bank", rgba=[0.50, 0.44, 0.28, 1.0], specular=0.0, shininess=0.0)
-    _build_along(tree, track, "bank", material, BANK, group=BANK_GROUP, roughness=0.06)
+    _build_along(tree, track, "bank", material, BANK, roughness=0.06)
 
 
 def _build_along(
@@ -108,7 +111,6 @@ def _build_along(
     name: str,
     material: Any,
     section: Sequence[tuple[float, float]],
-    group: int,
     roughness: float = 0.0,
 ) -> None:
     """A mesh on either side of the track: a cross-section (distance beyond the edge, height) [m] carried around it."""
@@ -132,7 +134,7 @@ def _build_along(
             contype=0,
             conaffinity=0,
             mass=0,
-            group=group,
+            group=HIDING_GROUP,
         )
 
 
@@ -151,7 +153,7 @@ def _strip_faces(count: int, width: int, flip: bool) -> NDArray[np.int64]:
 def _pieces(track: Track) -> Array:
     """Arc lengths (n,) at which the pieces of borders and banks meet [m]."""
     count = round(track.length / PIECE)
-    return np.arange(count) * (track.length / count)
+    return np.arange(count, dtype=np.float64) * (track.length / count)
 
 
 def _hang_backdrop(tree: Any) -> None:
@@ -208,7 +210,7 @@ def ground_picture(track: Track) -> NDArray[np.uint8]:
         return total / np.sqrt(len(sizes))
 
     fine, coarse = grain(1, 3), grain(12, 40)
-    ruts = np.exp(-((np.abs(offset) - 0.19) ** 2) / (2 * 0.09**2)) * (0.7 + 0.15 * coarse)
+    ruts = np.exp(-((np.abs(offset) - 0.19) ** 2) / (2 * 0.09**2)) * (0.9 + 0.15 * coarse)
     dust = np.clip((np.abs(offset) - 0.7) / 0.8, 0.0, 1.0)
     dirt = _mix(_mix(DIRT, DRY, np.clip(0.6 * dust + 0.15 * coarse, 0.0, 1.0)), RUT, np.clip(ruts, 0.0, 1.0))
     wild = _mix(GRASS, STONE, np.clip(0.35 + 0.3 * coarse, 0.0, 1.0))
@@ -231,7 +233,7 @@ def _offsets(track: Track) -> Array:
     left = np.cos(heading[nearest]) * towards[..., 1] - np.sin(heading[nearest]) * towards[..., 0]
     fine = (np.arange(PIXELS) + 0.5) * COARSE / PIXELS - 0.5
     signed = np.copysign(distance, left)
-    return map_coordinates(signed, np.meshgrid(fine, fine, indexing="ij"), order=1, mode="nearest")
+    return np.asarray(map_coordinates(signed, np.meshgrid(fine, fine, indexing="ij"), order=1, mode="nearest"))
 
 
 def backdrop_picture() -> NDArray[np.uint8]:

@@ -29,8 +29,10 @@ LATERALS = (-0.5, 0.0, 0.5)
 """Lateral offsets for which sight distances are known [m]."""
 NEAREST, FURTHEST, GRID = 4.0, 14.0, 0.5
 """Sight distances are found out between these, on this grid [m]."""
-EYE_HEIGHT = 0.12
+BODY_HEIGHT = 0.12
 """Of the car's body above the ground [m]."""
+APPROACH = (3.0, 4.0, 5.0, 6.0)
+"""Distances before it [m] from at least one of which it can be seen."""
 SCATTER = 0.6
 """Of several places with about the right sight distance [m], any may be taken."""
 TYPICAL = "obstacle_box"
@@ -57,10 +59,17 @@ class Placing:
         cost = rng.uniform(0.0, SCATTER, len(places))
         if placed.sight is not None:
             cost += np.abs(self.distances(places, placed.lateral) - placed.sight)
-        for s in places[np.argsort(cost)]:
-            placed.place(self.model, self.track, float(s))
-            if not self.sight.sees(qpos[:3], qpos[3:7], placed.points):
-                return
+        order = places[np.argsort(cost)]
+        for side in (1.0, -1.0):  # the other side where this one offers nothing
+            placed.lateral *= side
+            for s in order:
+                placed.place(self.model, self.track, float(s))
+                if not self.sight.sees(qpos[:3], qpos[3:7], placed.points) and self._shows(placed, float(s)):
+                    return
+
+    def _shows(self, placed: Placed, s: float) -> bool:
+        """Whether a car in the middle of the track sees it on the way to arc length `s` [m]."""
+        return any(_sees_from(self.track, self.sight, s - distance, placed.points) for distance in APPROACH)
 
     def distances(self, s: Array, lateral: float) -> Array:
         """Sight distances (n,) [m] of obstacles at arc lengths (n,) and a lateral offset."""
@@ -92,12 +101,16 @@ def _first_sight(track: Track, sight: Sight, points: Array, s: float, lateral: f
     x, y = track.point(s, lateral)
     turned = points @ _about_z(float(track.heading(s))).T + (x, y, 0.0)
     for distance in np.arange(NEAREST, FURTHEST, GRID):
-        px, py = track.position(s - distance)
-        yaw = float(track.heading(s - distance))
-        quaternion = np.array([math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)])
-        if not sight.sees(np.array([px, py, EYE_HEIGHT]), quaternion, turned):
+        if not _sees_from(track, sight, s - distance, turned):
             return float(distance) - 0.5 * GRID
     return FURTHEST
+
+
+def _sees_from(track: Track, sight: Sight, s: float, points: Array) -> bool:
+    """Whether a car in the middle of the track at arc length `s` [m] sees any of the points (n, 3)."""
+    x, y = track.position(s)
+    half = 0.5 * track.heading_at(s)
+    return sight.sees(np.array([x, y, BODY_HEIGHT]), np.array([math.cos(half), 0.0, 0.0, math.sin(half)]), points)
 
 
 def _about_z(angle: float) -> Array:

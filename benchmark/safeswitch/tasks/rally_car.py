@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -18,12 +17,27 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safeswitch.names import unknown
 from safeswitch.protocols import Expert
 from safeswitch.tasks import course
 from safeswitch.tasks.base import TaskEnv
+from safeswitch.tasks.car_geometry import (
+    FOOTPRINT,
+    FRONT,
+    GAUGE,
+    REACH,
+    REAR,
+    TYRE_RADIUS,
+    WHEELS,
+    bicycle_angle,
+    corners,
+    front_angles,
+    settle,
+    whole_car,
+    yaw_of,
+)
 from safeswitch.tasks.disturbances import Disturbance
 from safeswitch.tasks.placing import Placing
+from safeswitch.tasks.rally_car_config import CONTROL_DT, RallyCarConfig
 from safeswitch.tasks.rally_disturbances import Placed, RallyDisturbance
 from safeswitch.tasks.sight import Sight
 from safeswitch.tasks.track import Track
@@ -31,88 +45,14 @@ from safeswitch.tasks.track import track as find_track
 
 Array = NDArray[np.float64]
 
-CONTROL_DT = 0.05
-"""Control period [s]."""
-TIMESTEP = 0.005
-"""Time step of the simulation [s]: yaw rates agree with those at 0.0025 s to 0.1 %."""
-HORIZON = 120
-"""T, control steps of an episode: 6 s, long enough to meet an obstacle and drive on."""
-SPEED = 4.0
-"""[m/s]"""
-SPEED_GAIN = 2.0
-"""Throttle per error of the speed [1/(m/s)]."""
 STEERING_LIMIT = 0.40
 """Steering angle at action 1 [rad], of the bicycle that turns like the car."""
-WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
-FRONT, REAR = 0.34, 0.23
-"""Distance of the axles from the centre of mass [m]."""
-GAUGE = 0.38
-"""Distance of the wheels of an axle, and of the points about which the front ones turn [m]."""
-TYRE_RADIUS = 0.095
-"""[m]"""
-FOOTPRINT = (-0.395, 0.505, 0.2265)
-"""Rear and front end of the car seen from its centre of mass, and half its width over the tyres [m]."""
-REACH = math.hypot(FOOTPRINT[1], FOOTPRINT[2])
-"""No point of the car is further from its centre of mass [m]."""
 NEAR = 1.5
 """Within this distance of an obstacle [m], contacts are looked for at every simulator step."""
 LOWEST_UPRIGHT = 0.5
 """The car has turned over when its vertical axis is tilted by more than 60 degrees."""
 PREVIEW = (0.0, 1.0, 2.0, 3.5, 5.0)
 """Distances ahead at which the curvature is observed [m]."""
-ONSET_RANGE = (0.1, 0.6)
-"""The onset of a disturbance that is not placed is uniform between these shares of the episode."""
-
-
-@dataclass(frozen=True)
-class RallyCarConfig:
-    """Everything that decides how hard the task is. `RallyCarEnv` takes any of these as keyword arguments.
-
-    Attributes:
-        control_dt: control period [s].
-        timestep: time step of the simulation [s]; control_dt is a multiple of it.
-        horizon: T, control steps of an episode.
-        speed: at which an episode starts, and which the car with images holds [m/s].
-        speed_gain: of the speed controller, throttle per error [1/(m/s)].
-        spread_e_y: starts are uniform within +- this of the centreline [m].
-        spread_e_psi: starts are uniform within +- this of the track's direction [rad].
-        spread_speed: starts are uniform within +- this of `speed` [m/s].
-        image_noise: standard deviation of the noise of every pixel, as a share of the full range.
-        onset_low: earliest onset as a share of the episode, of disturbances that are not placed.
-        onset_high: latest onset as a share of the episode.
-    """
-
-    control_dt: float = CONTROL_DT
-    timestep: float = TIMESTEP
-    horizon: int = HORIZON
-    speed: float = SPEED
-    speed_gain: float = SPEED_GAIN
-    spread_e_y: float = 0.25
-    spread_e_psi: float = 0.10
-    spread_speed: float = 0.2
-    image_noise: float = 0.009
-    onset_low: float = ONSET_RANGE[0]
-    onset_high: float = ONSET_RANGE[1]
-
-    def __post_init__(self) -> None:
-        """Refuse numbers that make no drive."""
-        for name, value in asdict(self).items():
-            positive = name in ("control_dt", "timestep", "horizon", "speed")
-            if not (math.isfinite(value) and (value > 0.0 if positive else value >= 0.0)):
-                raise ValueError(f"{name} must be finite and {'> 0' if positive else '>= 0'}, got {value!r}")
-        if not self.onset_low <= self.onset_high < 1.0:
-            raise ValueError(f"need onset_low <= onset_high < 1, got {self.onset_low} and {self.onset_high}")
-        if self.horizon != int(self.horizon):
-            raise ValueError(f"horizon must be a number of steps, got {self.horizon!r}")
-
-    @classmethod
-    def of(cls, **design: float) -> RallyCarConfig:
-        """The configuration with some numbers replaced; an unknown name lists the valid ones."""
-        valid = [field.name for field in fields(cls)]
-        for name in design:
-            if name not in valid:
-                raise unknown("argument of RallyCarEnv", name, valid)
-        return cls(**design)  # type: ignore[arg-type]
 
 
 class RallyCarEnv(TaskEnv):
@@ -149,7 +89,7 @@ class RallyCarEnv(TaskEnv):
     ## Start, end, success
 
     The car starts anywhere along the lap, near the middle (+-0.25 m, +-0.1 rad), at about 4 m/s with settled suspension
-    and turning wheels. The episode *terminates*, a failure, when any part of the car leaves the track of 3 m width, when
+    and turning wheels. The episode *terminates*, a failure, when any part of the car leaves the track (3 m wide), when
     it touches an obstacle, or when it turns over. It is *truncated* after T = 120 steps of 0.05 s, a success.
 
     ## Info (the same keys at reset and at every step)
@@ -164,8 +104,8 @@ class RallyCarEnv(TaskEnv):
     | `onset` | int | t0, -1 in an undisturbed episode, T until a placed disturbance comes into view |
 
     Parameters: mass [kg] and yaw_inertia [kg m^2] of the whole car, l_f and l_r from its centre of mass to the axles
-    [m], friction of the ground under the wheels (mean), steering_bias [rad], and of an obstacle obstacle_s and obstacle_e
-    (curvilinear) and obstacle_radius of a circle that covers it [m]; all 0 until it is in view.
+    [m], friction of the ground under the wheels (mean), steering_bias [rad], and of an obstacle obstacle_s and
+    obstacle_e (curvilinear) and obstacle_radius of a circle that covers it [m]; all 0 until it is in view.
 
     ## Arguments
 
@@ -231,7 +171,7 @@ class RallyCarEnv(TaskEnv):
         self._spin_qvel = [int(model.joint(f"spin_{name}").dofadr[0]) for name in WHEELS]
         self._tyres = [model.geom(f"tyre_{name}").id for name in WHEELS]
         self._ground = model.geom("ground").id
-        self._settled = _settle(model)
+        self._settled = settle(model)
         self._sight: Sight | None = None
         high = np.array([self.track.length, 3.0, math.pi, 15.0, 15.0, 15.0, 0.6, *[1.0] * len(PREVIEW)], np.float32)
         low = -high
@@ -283,7 +223,7 @@ class RallyCarEnv(TaskEnv):
 
     def _read_state(self) -> Array:
         qpos, qvel = self._qpos.tolist(), self._qvel.tolist()
-        yaw = _yaw(qpos)
+        yaw = yaw_of(qpos)
         cos, sin = math.cos(yaw), math.sin(yaw)
         s, e_y = self.track.project(qpos[0], qpos[1])
         e_psi = math.remainder(yaw - self.track.heading_at(s), math.tau)
@@ -304,7 +244,7 @@ class RallyCarEnv(TaskEnv):
         bias, obstacle = 0.0, (0.0, 0.0, 0.0)
         if model is self.simulator.disturbed and isinstance(self.disturbance, RallyDisturbance):
             bias, obstacle = self.disturbance.steering_bias, self.disturbance.obstacle
-        mass, inertia, front, rear = _bicycle(self.simulator.nominal)
+        mass, inertia, front, rear = whole_car(self.simulator.nominal)
         friction = self.simulator.nominal.geom(f"tyre_{WHEELS[0]}").friction[0]
         return np.array([mass, inertia, front, rear, friction, bias, *obstacle])
 
@@ -343,7 +283,7 @@ class RallyCarEnv(TaskEnv):
         if not isinstance(self.disturbance, Placed):
             return None
         x, y, *_ = self._qpos
-        return self.disturbance.grip(_corners(x, y, _yaw(self._qpos), (-REAR, FRONT, 0.5 * GAUGE)))
+        return self.disturbance.grip(corners(x, y, yaw_of(self._qpos), (-REAR, FRONT, 0.5 * GAUGE)))
 
     def _watcher(self) -> Callable[[], None] | None:
         self._touched = False
@@ -372,8 +312,8 @@ class RallyCarEnv(TaskEnv):
         s, e_y = self.track.project(x, y)
         if abs(e_y) + REACH < self.track.half_width:
             return True
-        corners = _corners(x, y, _yaw(self._qpos), FOOTPRINT).tolist()
-        return all(abs(self.track.project(*corner, near=s)[1]) <= self.track.half_width for corner in corners)
+        outline = corners(x, y, yaw_of(self._qpos), FOOTPRINT).tolist()
+        return all(abs(self.track.project(ahead, left, near=s)[1]) <= self.track.half_width for ahead, left in outline)
 
     def _reward(self) -> float:
         state = self._read_state()
@@ -403,56 +343,3 @@ class RallyCarEnv(TaskEnv):
         if self._sight is None:
             self._sight = Sight(self.simulator.nominal, "onboard", aspect=2.0)
         return self._sight
-
-
-def front_angles(delta: float) -> tuple[float, float]:
-    """Angles of the left and the right front wheel [rad] that turn like a bicycle's at `delta` (Ackermann).
-
-    The centre of the turn lies on the rear axle, R = (l_f + l_r) / tan(delta) from its middle; the wheels' own centres
-    of turn are half the gauge nearer to it and further from it.
-    """
-    slope, half = math.tan(delta), 0.5 * GAUGE / (FRONT + REAR)
-    return math.atan(slope / (1.0 - half * slope)), math.atan(slope / (1.0 + half * slope))
-
-
-def bicycle_angle(left: float, right: float) -> float:
-    """Angle of the bicycle's wheel [rad], the mean of what the left and the right one say; inverse of `front_angles`."""
-    half = 0.5 * GAUGE / (FRONT + REAR)
-    first, second = math.tan(left), math.tan(right)
-    return math.atan(0.5 * (first / (1.0 + half * first) + second / (1.0 - half * second)))
-
-
-def _yaw(qpos: Any) -> float:
-    """Direction of the car's x axis, seen from above [rad]."""
-    w, x, y, z = qpos[3], qpos[4], qpos[5], qpos[6]
-    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-
-
-def _corners(x: float, y: float, yaw: float, rectangle: tuple[float, float, float]) -> Array:
-    """Corners (4, 2) [m] of a rectangle (rear, front, half width) of the car: front left, front right, rear ..."""
-    rear, front, half = rectangle
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    ahead, left = np.array([front, front, rear, rear]), np.array([half, -half, half, -half])
-    return np.column_stack([x + cos * ahead - sin * left, y + sin * ahead + cos * left])
-
-
-def _bicycle(model: mujoco.MjModel) -> tuple[float, float, float, float]:
-    """Mass [kg], yaw inertia [kg m^2] and distances of the axles from the centre of mass [m] of the whole car."""
-    bodies = [model.body("car").id, *(model.body(name).id for name in WHEELS)]
-    masses = model.body_mass[bodies]
-    # In the frame of the car: wheels hang at their pos, and their axes are its axes.
-    places = np.array([model.body_ipos[bodies[0]], *model.body_pos[bodies[1:]]])
-    centre = masses @ places / masses.sum()
-    away = places[:, :2] - centre[:2]
-    inertia = float((model.body_inertia[bodies, 2] + masses * (away**2).sum(1)).sum())
-    front, rear = (float(model.body(name).pos[0]) for name in (WHEELS[0], WHEELS[2]))
-    return float(masses.sum()), inertia, front - float(centre[0]), float(centre[0]) - rear
-
-
-def _settle(model: mujoco.MjModel) -> Array:
-    """Positions (nq,) of the car at rest on its springs, at the origin."""
-    data = mujoco.MjData(model)
-    mujoco.mj_step(model, data, nstep=round(2.0 / model.opt.timestep))
-    settled = data.qpos.copy()
-    settled[:2] = 0.0
-    return settled

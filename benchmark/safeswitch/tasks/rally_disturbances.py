@@ -1,7 +1,7 @@
 """Disturbances of the rally car.
 
-What is `placed` stands beside or on the track from the reset on, out of view, and sets in when the camera first sees it;
-the others set in at a step that is drawn. Kinds of `obstacle-held-out` never occur in `obstacle`.
+What is `placed` stands beside or on the track from the reset on, out of view, and sets in when the camera first sees
+it; the others set in at a step that is drawn. Kinds of `obstacle-held-out` never occur in `obstacle`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from safeswitch.tasks.sight import surface_points
 from safeswitch.tasks.track import Track
 
 CARS = frozenset({"rally-car", "rally-car-image"})
-CAR_IMAGES = frozenset({"rally-car-image"})
 
 Colour = tuple[float, float, float]
 
@@ -104,7 +103,7 @@ class Obstacle(Placed):
     kind = "appearance"
     levels = (9.5, 8.5, 7.5, 6.8, 6.2)
     sentence = "an obstacle stands on the track, seen from about {:g} m"
-    bodies = ("obstacle_box", "obstacle_barrel", "obstacle_ball", "obstacle_slab")
+    bodies: ClassVar[tuple[str, ...]] = ("obstacle_box", "obstacle_barrel", "obstacle_ball", "obstacle_slab")
     OFFSET: ClassVar[tuple[float, ...]] = (0.6, 0.45, 0.3, 0.2, 0.1)
     """Largest distance from the centreline [m], per severity."""
     COLOURS: ClassVar[tuple[Colour, ...]] = (
@@ -259,85 +258,6 @@ class LocalisationBias(RallyDisturbance):
         observation = observation.copy()
         observation[1] += self._bias
         return observation
-
-
-@offer
-class Dusk(RallyDisturbance):
-    """It gets dark: sun, sky and everything that shines are dimmed."""
-
-    name = "dusk"
-    kind = "appearance"
-    tasks = CAR_IMAGES
-    only_seen = True
-    levels = (0.85, 0.7, 0.55, 0.4, 0.25)
-    sentence = "all light is multiplied by {:g}"
-
-    def alter(self, nominal: mujoco.MjModel, model: mujoco.MjModel) -> None:
-        """Scale every light, the one at the camera, and what materials emit."""
-        for name in ("light_ambient", "light_diffuse", "light_specular", "mat_emission"):
-            getattr(model, name)[:] = self.value * getattr(nominal, name)
-        for name in ("ambient", "diffuse", "specular"):
-            getattr(model.vis.headlight, name)[:] = self.value * getattr(nominal.vis.headlight, name)
-
-
-@offer
-class CameraPitch(RallyDisturbance):
-    """The camera's mount gives way: it looks further up or down."""
-
-    name = "camera-pitch"
-    kind = "sensing"
-    tasks = CAR_IMAGES
-    only_seen = True
-    levels = (1.0, 2.0, 4.0, 6.0, 9.0)
-    sentence = "the camera is tilted by {:g} degrees, up or down"
-
-    def reset(self, rng: np.random.Generator, horizon: int) -> None:
-        """Draw up or down."""
-        self._angle = math.radians(self.value) * float(rng.choice((-1.0, 1.0)))
-
-    def alter(self, nominal: mujoco.MjModel, model: mujoco.MjModel) -> None:
-        """Turn the camera about its own x axis."""
-        camera = nominal.camera("onboard").id
-        half, turned = 0.5 * self._angle, np.empty(4)
-        mujoco.mju_mulQuat(turned, nominal.cam_quat[camera], np.array([math.cos(half), math.sin(half), 0.0, 0.0]))
-        model.cam_quat[camera] = turned
-        mat = np.empty(9)
-        mujoco.mju_quat2Mat(mat, turned)
-        model.cam_mat0[camera] = mat
-
-
-@offer
-class CameraDirt(RallyDisturbance):
-    """A splash of mud on the lens: a soft, brown blotch that covers part of the picture."""
-
-    name = "camera-dirt"
-    kind = "sensing"
-    tasks = CAR_IMAGES
-    only_seen = True
-    levels = (0.06, 0.10, 0.16, 0.22, 0.30)
-    sentence = "a blotch of dirt with a radius of {:g} times the width covers part of the picture"
-    COLOUR: ClassVar[Array] = np.array((62.0, 48.0, 36.0))
-    SOFT: ClassVar[float] = 0.35
-    """Share of the radius over which it fades."""
-
-    def reset(self, rng: np.random.Generator, horizon: int) -> None:
-        """Draw the place, as shares of the picture, and the outline."""
-        self._row, self._column = rng.uniform(0.15, 0.85, 2)
-        self._lobes = rng.uniform(0.0, 0.15, 3)
-        self._phases = rng.uniform(-math.pi, math.pi, 3)
-
-    def sense(self, observation: NDArray[Any], step: int) -> NDArray[Any]:
-        """Cover the blotch."""
-        height, width = observation.shape[:2]
-        down = (np.arange(height)[:, None] + 0.5 - self._row * height) / (self.value * width)
-        right = (np.arange(width)[None, :] + 0.5 - self._column * width) / (self.value * width)
-        angle = np.arctan2(down, right)
-        outline = 1.0 + sum(
-            lobe * np.sin(order * angle + phase)
-            for order, lobe, phase in zip((2, 3, 5), self._lobes, self._phases, strict=True)
-        )
-        cover = np.clip((outline - np.hypot(down, right)) / self.SOFT + 0.5, 0.0, 1.0)[..., None]
-        return np.rint((1.0 - cover) * observation + cover * self.COLOUR).astype(np.uint8)
 
 
 def _turned(angle: float) -> Array:

@@ -1,8 +1,8 @@
-"""What the rally car's camera can see, without rendering: the frustum, and the banks as occluders.
+"""What the rally car's camera can see, without rendering: the frustum, and banks and tubes as occluders.
 
-A pixel of an object shows when a point of its surface lies within the camera's field of view and no bank stands between
-them. Points are sampled on the surface; rays of sight are MuJoCo's, on the very triangles that are drawn. The camera's
-pose is computed from the car's, so that the answer is a function of the state alone.
+A pixel of an object shows when a point of its surface lies within the camera's field of view and no bank or tube is
+between them. Points are sampled on the surface; rays of sight are MuJoCo's, on the very triangles that are drawn. The
+camera's pose is computed from the car's, so that the answer is a function of the state alone.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from safeswitch.tasks.course import BANK_GROUP
+from safeswitch.tasks.course import HIDING_GROUP
 
 Array = NDArray[np.float64]
 
@@ -21,6 +21,8 @@ FAR = 30.0
 """Nothing is looked for beyond this distance [m]: there it is smaller than a pixel, or behind a bank."""
 ROUND = 12
 """Points on a circle of a round surface."""
+SLIVER = 0.006
+"""Height of what is seen of an object, divided by half the height of the picture, below which no pixel of it shows."""
 SHARE = 0.97
 """Of the way to a point that must be free: a patch on the ground or an object against a bank does not hide itself."""
 
@@ -43,10 +45,10 @@ class Sight:
         up = math.tan(0.5 * math.radians(float(model.cam_fovy[index])))
         self._half = np.array([aspect * up, up])
         self._groups = np.zeros(mujoco.mjNGROUP, np.uint8)
-        self._groups[BANK_GROUP] = 1
+        self._groups[HIDING_GROUP] = 1
 
     def sees(self, position: Array, quaternion: Array, points: Array) -> bool:
-        """Whether any of the points (n, 3) [m] is in view.
+        """Whether any of the points (n, 3) [m] is in view, and more than a sliver.
 
         Args:
             position: (3,) of the car's body [m].
@@ -67,7 +69,11 @@ class Sight:
         mujoco.mj_multiRay(
             self.model, self._data, eye, chosen.ravel(), self._groups, 1, -1, hit, distance, None, count, FAR
         )
-        return bool(np.any((distance < 0.0) | (distance > SHARE)))  # in units of the ray
+        free = (distance < 0.0) | (distance > SHARE)  # in units of the ray
+        if not free.any():
+            return False
+        height = (up[inside] / back[inside])[free] / self._half[1]
+        return bool(np.ptp(height) > SLIVER)
 
 
 def surface_points(model: mujoco.MjModel, body: str) -> Array:
@@ -81,7 +87,7 @@ def surface_points(model: mujoco.MjModel, body: str) -> Array:
 
 
 def _box(size: Array) -> Array:
-    ticks = np.linspace(-1.0, 1.0, 5)
+    ticks = np.linspace(-1.0, 1.0, 7)
     lattice = np.stack(np.meshgrid(ticks, ticks, ticks), axis=-1).reshape(-1, 3)
     return lattice[np.abs(lattice).max(1) == 1.0] * size
 
