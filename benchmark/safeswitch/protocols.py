@@ -187,6 +187,7 @@ class Calibrated:
         tuning_episodes: episodes spent on calibration (candidates x episodes for searches).
         expert_queries: expert-driven steps spent on calibration.
         log: arrays worth keeping, such as every CEM sample (name -> array).
+        reads: signals that the rule looks at, None for all of them: plain episodes compute no others.
     """
 
     rule: Any
@@ -194,6 +195,7 @@ class Calibrated:
     tuning_episodes: int = 0
     expert_queries: int = 0
     log: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    reads: tuple[str, ...] | None = None
 
 
 @runtime_checkable

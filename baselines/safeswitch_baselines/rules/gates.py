@@ -89,7 +89,7 @@ class SafeDAgger(OnDiscrepancy):
 
     def calibrate(self, calibration: Calibration) -> Calibrated:
         """Nothing to choose: the classifier's own boundary."""
-        return Calibrated(SafetyGate(self.signal), 0.5)
+        return Calibrated(SafetyGate(self.signal), 0.5, reads=(self.signal,))
 
 
 class LazyGate(Gate):
@@ -124,7 +124,7 @@ class LazyDAgger(OnDiscrepancy):
 
     def calibrate(self, calibration: Calibration) -> Calibrated:
         """Nothing to choose."""
-        return Calibrated(LazyGate(self.signal, TAU / LAZY_RATIO**0.5), 0.5)
+        return Calibrated(LazyGate(self.signal, TAU / LAZY_RATIO**0.5), 0.5, reads=(self.signal,))
 
 
 class EnsembleGate(Gate):
@@ -159,7 +159,8 @@ class EnsembleDAgger(SignalMethod):
     def calibrate(self, calibration: Calibration) -> Calibrated:
         """Quantile over steps."""
         doubt = float(np.nanquantile(calibration.nominal.signals[self.signal], 0.99))
-        return Calibrated(EnsembleGate(self.signal, doubt, TAU), doubt, len(calibration.nominal))
+        rule = EnsembleGate(self.signal, doubt, TAU)
+        return Calibrated(rule, doubt, len(calibration.nominal), reads=(self.signal,))
 
 
 class ThriftyGate(Gate):
