@@ -27,7 +27,7 @@ REFERENCES = ("learner", "expert", "timer")
 def find_cell(task: Task, disturbance: str, severity: int) -> Cell:
     """The task's cell; an unknown one lists the valid ones, nearest first."""
     for cell in task.cells:
-        if cell.disturbance == disturbance and cell.severity in (severity, 0):
+        if cell.label == disturbance and cell.severity in (severity, 0):
             return cell
     raise unknown("cell", f"{task.name}/{disturbance}-{severity}", map(str, task.cells))
 
