@@ -18,7 +18,7 @@ from safeswitch.handover.episode import run_episode
 from safeswitch.handover.panel import Calibration, Panel
 from safeswitch.handover.shown import shown_traces
 from safeswitch.handover.table import HandoverTable, concatenate
-from safeswitch.protocols import ARMINGS, Arming, Calibrated
+from safeswitch.protocols import ARMINGS, Arming
 from safeswitch.scoring.metrics import OTHERS
 from safeswitch.scoring.rows import episode_rows, latched_rows
 from safeswitch.scoring.sightings import sightings
@@ -72,7 +72,7 @@ def _score_episodes(
             if method.latched:
                 rows = latched_rows(test, calibrated)
             else:
-                rows = _plain_rows(task, cell, trained, test, method, calibrated)
+                rows = _plain_rows(task, cell, trained, test, method, calibrated.rule)
             frames.append(labelled(rows, cell, protocol, method_id, trained.seed, calibrated, own))
             logs.update({f"{protocol}|{method_id}|{name}": value for name, value in calibrated.log.items()})
         if others is not None:
@@ -125,11 +125,10 @@ def _panel(table: HandoverTable, nominal: HandoverTable, cell: Cell, protocol: A
 
 
 def _plain_rows(
-    task: Task, cell: Cell, trained: Trained, test: Panel, method: Method, calibrated: Calibrated
+    task: Task, cell: Cell, trained: Trained, test: Panel, method: Method, rule: Any
 ) -> pd.DataFrame:
     """Rules that give control back have no table: drive the same episodes."""
-    driver, rule, reads = trained.learner(task), calibrated.rule, calibrated.reads
-    signals = [signal for signal in trained.signals(task) if reads is None or signal.id in reads]
+    driver, signals = trained.learner(task), trained.signals(task, getattr(rule, "reads", None))
     envs = {True: make_env(task, cell), False: make_env(task, task.undisturbed(cell))}
     experts = {kind: env.make_expert() for kind, env in envs.items()}
     advisers = {kind: env.make_expert() if "expert-queries" in method.needs else None for kind, env in envs.items()}
