@@ -133,10 +133,9 @@ class Run:
         for group in (none, tuple(cell for cell in cells if cell not in none)):  # the others share outcomes of `none`
             stage = []
             for trained, cell in product(self.trained, group):
-                counts: dict[Split, int] = {"test": self.profile.test}
-                if cell in calibrated_on:
-                    counts["calibrate"] = self.profile.calibrate
-                for split, count in counts.items():
+                splits: tuple[Split, ...] = ("test", "calibrate") if cell in calibrated_on else ("test",)
+                for split in splits:
+                    count = self.profile.episodes(task, cell, split)
                     twins = chunks.get((trained.seed, task.undisturbed(cell), split), ())
                     jobs = table_jobs(self.store, task, cell, split, count, trained, twins)
                     chunks[trained.seed, cell, split] = jobs
@@ -149,7 +148,7 @@ class Run:
                 keys[seed, task.undisturbed(task.calibrated_on(cell)), "calibrate"],
                 keys[seed, cell, "test"],
                 keys[seed, task.undisturbed(cell), "test"],
-                tuple((other, keys[seed, other, "calibrate"]) for other in others(cell, cells)),
+                tuple((other, keys[seed, other, "calibrate"]) for other in others(cell, cells) if not task.costly),
             )
             for seed in range(len(self.learners))
             for cell in cells
@@ -185,7 +184,7 @@ class Run:
                 cell,
                 self.trained[seed],
                 keys,
-                tables[seed, str(self.task.undisturbed(cell))].test[: None if (seed, cell) in test else chunks],
+                tables[seed, str(self.task.undisturbed(cell))].test[: len(keys) or chunks],
             )
             for (seed, cell), keys in {**test, **further}.items()
         ]
@@ -247,7 +246,7 @@ class Run:
         return Run(task, profile, self.store, self.workers)
 
     def _gives_back(self, cell: object) -> bool:
-        return cell in self.task.cells[: self.profile.give_back_cells]
+        return cell in self.task.cells[: self.profile.give_back_cells] and not self.task.costly
 
     def finish(self, stage: str, jobs: Iterable[Job]) -> None:
         """Run the jobs that the store does not hold yet, `workers` at a time, with a progress bar."""

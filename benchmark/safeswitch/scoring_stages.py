@@ -121,7 +121,12 @@ def _panel(table: HandoverTable, nominal: HandoverTable, cell: Cell, protocol: A
     """Disturbed episodes, and under `start` their undisturbed twins beside them."""
     if cell.tag == "none":
         return Panel(nominal, protocol)
-    return Panel(concatenate([table, nominal]) if protocol == "start" else table, protocol)
+    if protocol == "onset":
+        return Panel(table, protocol)
+    twins = nominal.take(np.arange(len(table)))
+    if not np.array_equal(twins.seeds, table.seeds):
+        raise ValueError(f"the undisturbed episodes are no twins of those of {cell}: seeds differ")
+    return Panel(concatenate([table, twins]), protocol)
 
 
 def _plain_rows(

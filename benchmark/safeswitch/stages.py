@@ -157,7 +157,7 @@ def table_jobs(
             "split": split,
             "seeds": episode_seeds(split, size, first),
             "signals": list(task.signals),
-            "complete": cell.complete(split),
+            "complete": cell.complete(split, task.costly),
         }
         key = store.key("table", settings, [*trained.keys, *twin], code)
         label = f"{cell} {split} {first}-{first + size - 1} (learner {trained.seed})"
@@ -181,7 +181,7 @@ def _tabulate(
     table = record_table(env, trained.learner(task), trained.signals(task), env.make_expert(), seeds)
     for twin in twins:
         table.share(HandoverTable.load(Path(twin) / "table.npz"))
-    if cell.complete(split):
+    if cell.complete(split, task.costly):
         table.complete()
     table.save(folder / "table.npz")
     env.close()

@@ -62,9 +62,9 @@ class Cell:
         """Whether thresholds are also calibrated on the other disturbances: severity 3 of what does harm."""
         return self.severity == 3 and self.tag in ("paper", "other")
 
-    def complete(self, split: Split) -> bool:
+    def complete(self, split: Split, costly: bool) -> bool:
         """Whether every outcome is computed in advance: tables that many rules, and cells, come back to."""
-        often = self.left_out and split == "calibrate"
+        often = self.left_out and split == "calibrate" and not costly
         return self.tag == "none" or (self.tag == "paper" and self.severity == 3) or often
 
     @property
@@ -93,6 +93,8 @@ class Task:
         literal: the learner as the paper describes it, where it is not the one above; it is reported beside it.
         literal_options: overrides of its configuration.
         others: most learners of other seeds that an ensemble asks beside its own; None for all of them.
+        costly: whether an outcome takes so long that a run must do without some: cells after the first three then have
+            half the episodes, and no cell has rows that leave its disturbance out or rules that give control back.
     """
 
     name: str
@@ -109,6 +111,7 @@ class Task:
     literal: str = ""
     literal_options: Mapping[str, Any] = field(default_factory=dict, hash=False)
     others: int | None = None
+    costly: bool = False
 
     @property
     def paper_cell(self) -> Cell:
@@ -321,6 +324,7 @@ TASKS: dict[str, Task] = {
         assets=("rally_car", "common"),
         showcase=("ensemble-mean3", "mahalanobis"),
         others=2,
+        costly=True,
     ),
 }
 
@@ -395,6 +399,11 @@ class Profile:
     def cells_of(self, task: Task) -> tuple[Cell, ...]:
         """The cells of `task` in this profile."""
         return task.cells[: self.cells]
+
+    def episodes(self, task: Task, cell: Cell, split: Split) -> int:
+        """Calibrate or test episodes of a cell for each learner."""
+        count = self.test if split == "test" else self.calibrate
+        return -(-count // 2) if task.costly and cell not in task.cells[:3] else count
 
 
 PROFILES: dict[str, Profile] = {
