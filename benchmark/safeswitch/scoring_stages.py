@@ -15,9 +15,10 @@ from safeswitch import registry
 from safeswitch.files import save_arrays, save_frame
 from safeswitch.handover.episode import run_episode
 from safeswitch.handover.panel import Calibration, Panel
+from safeswitch.handover.published import armings_of, panel_of
 from safeswitch.handover.shown import shown_traces
-from safeswitch.handover.table import HandoverTable, concatenate
-from safeswitch.protocols import ARMINGS, Arming
+from safeswitch.handover.table import HandoverTable
+from safeswitch.protocols import Arming
 from safeswitch.scoring.rows import episode_rows, latched_rows
 from safeswitch.scoring.signal_quality import SignalQuality, frame_quality, signal_quality
 from safeswitch.stages import CellTables, Job, concat, load_table, make_env, only_seen, recorded_table, source_of
@@ -76,28 +77,22 @@ def _score_episodes(
 
 
 def protocols_of(cell: Cell) -> tuple[Arming, ...]:
-    """Armings under which a cell is scored: without a disturbance there is no onset."""
-    return ("start",) if cell.tag == "none" else ARMINGS
+    """Armings under which a cell is scored."""
+    return armings_of(cell.disturbance)
 
 
 def test_panel(loaded: dict[str, HandoverTable], cell: Cell, protocol: Arming) -> Panel:
     """Test episodes of a cell under an arming."""
-    return _panel(loaded["test"], loaded["test_nominal"], cell, protocol)
+    nominal = None if cell.tag == "none" else loaded["test_nominal"]
+    return panel_of(loaded["test"], nominal, protocol)
 
 
 def calibration_of(
     loaded: dict[str, HandoverTable], task: Task, cell: Cell, protocol: Arming, seed: int
 ) -> Calibration:
     """Calibrate episodes of a cell under an arming."""
-    panel = _panel(loaded["calibrate"], loaded["calibrate_nominal"], task.calibrated_on(cell), protocol)
-    return Calibration(panel, loaded["calibrate_nominal"], seed=seed)
-
-
-def _panel(table: HandoverTable, nominal: HandoverTable, cell: Cell, protocol: Arming) -> Panel:
-    """Disturbed episodes, and under `start` their undisturbed twins beside them."""
-    if cell.tag == "none":
-        return Panel(nominal, protocol)
-    return Panel(concatenate([table, nominal]) if protocol == "start" else table, protocol)
+    nominal = loaded["calibrate_nominal"]
+    return Calibration(panel_of(loaded["calibrate"], nominal, protocol), nominal, seed=seed)
 
 
 def _plain_rows(task: Task, cell: Cell, trained: Trained, test: Panel, rule: Any) -> pd.DataFrame:

@@ -1,0 +1,139 @@
+"""Published handover tables: compact files of one task, from which latched rules are scored without a simulator.
+
+A folder holds one file per (cell, split, learner), `<disturbance>-<severity>-<split>-learner<seed>.npz`, as the full
+profile writes them to `results/tables/<task>/`. The split is part of the name, and the episode seeds inside must be of
+that split: nothing is calibrated on what it is tested on.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from safeswitch.handover.outcomes import UNKNOWN
+from safeswitch.handover.panel import Panel
+from safeswitch.handover.table import HandoverTable, concatenate
+from safeswitch.names import unknown
+from safeswitch.protocols import ARMINGS, Arming
+from safeswitch.suite import SPLIT_SIZE, SPLITS, Cell, Split
+
+_NAME = re.compile(
+    r"(?P<disturbance>.+)-(?P<severity>\d+)(?:-(?P<split>calibrate|test))?-learner(?P<learner>\d+)\.npz"
+)
+"""Files without a split are of the first format, which had test episodes only."""
+
+
+def file_name(disturbance: str, severity: int, split: Split, learner: int) -> str:
+    """Name of the file of one (cell, split, learner seed)."""
+    return f"{disturbance}-{severity}-{split}-learner{learner}.npz"
+
+
+@dataclass(frozen=True)
+class PublishedTables:
+    """The tables of one task in a folder.
+
+    Attributes:
+        folder: where they are; its name is the task's.
+        files: (disturbance, severity, split, learner seed) -> file.
+    """
+
+    folder: Path
+    files: dict[tuple[str, int, str, int], Path]
+
+    @staticmethod
+    def find(folder: Path | str) -> PublishedTables:
+        """The tables in `folder`.
+
+        Raises:
+            ValueError: there are none, or two files claim to be the same table.
+        """
+        folder = Path(folder)
+        files: dict[tuple[str, int, str, int], Path] = {}
+        for path in sorted(folder.glob("*.npz")):
+            if match := _NAME.fullmatch(path.name):
+                key = (match["disturbance"], int(match["severity"]), match["split"] or "test", int(match["learner"]))
+                if key in files:
+                    raise ValueError(f"{files[key].name} and {path.name} in {folder} are the same table: keep one")
+                files[key] = path
+        if not files:
+            example = file_name("cart-mass", 3, "test", 0)
+            raise ValueError(f"{folder} holds no handover tables: expected files such as {example}")
+        return PublishedTables(folder, files)
+
+    @property
+    def task(self) -> str:
+        """Name of the task."""
+        return self.folder.absolute().name
+
+    @property
+    def learners(self) -> list[int]:
+        """Learner seeds."""
+        return sorted({learner for _, _, _, learner in self.files})
+
+    @property
+    def cells(self) -> list[tuple[str, int]]:
+        """(disturbance, severity) with test episodes, sorted; `none` has severity 0."""
+        return sorted({(name, severity) for name, severity, split, _ in self.files if split == "test"})
+
+    def has(self, disturbance: str, severity: int, split: Split, learner: int) -> bool:
+        """Whether there is such a table."""
+        return (disturbance, severity, split, learner) in self.files
+
+    def load(self, disturbance: str, severity: int, split: Split, learner: int) -> HandoverTable:
+        """One table.
+
+        Raises:
+            ValueError: there is none, or its episodes are not of that split.
+        """
+        name = file_name(disturbance, severity, split, learner)
+        if not self.has(disturbance, severity, split, learner):
+            known = (file_name(*key) for key in self.files)  # type: ignore[arg-type]
+            raise unknown(f"handover table in {self.folder}", name, known)
+        path = self.files[disturbance, severity, split, learner]
+        table = HandoverTable.load(path)
+        first = SPLITS.index(split) * SPLIT_SIZE
+        if ((table.seeds < first) | (table.seeds >= first + SPLIT_SIZE)).any():
+            of = sorted({SPLITS[int(seed) // SPLIT_SIZE] for seed in table.seeds})
+            raise ValueError(f"{path} holds episodes of {', '.join(of)}, not of {split}")
+        return table
+
+    def panel(self, disturbance: str, severity: int, split: Split, learner: int, arming: Arming) -> Panel:
+        """Episodes of a cell under an arming, every outcome known; under `start` with their undisturbed twins."""
+        table = self.load(disturbance, severity, split, learner)
+        nominal = self.load("none", 0, split, learner) if arming == "start" and disturbance != "none" else None
+        panel = panel_of(table, nominal, arming)
+        missing = int((panel.table.known() == UNKNOWN).sum())
+        if missing:
+            raise ValueError(
+                f"{missing} of {panel.table.known().size} outcomes of {self.task}/{disturbance}-{severity} "
+                f"(learner {learner}, {split}) are unknown, and there is no simulator here to compute them: publish "
+                "the tables again with `safeswitch bench --profile full`"
+            )
+        return panel
+
+
+def panel_of(table: HandoverTable, nominal: HandoverTable | None, arming: Arming) -> Panel:
+    """Episodes under an arming: disturbed ones, and under `start` the undisturbed `nominal` ones beside them."""
+    if arming not in ARMINGS:
+        raise unknown("arming", arming, ARMINGS)
+    if nominal is not None and arming == "start":
+        return Panel(concatenate([table, nominal]), arming)
+    return Panel(table, arming)
+
+
+def armings_of(disturbance: str) -> tuple[Arming, ...]:
+    """Armings under which a cell is scored: without a disturbance there is no onset."""
+    return ("start",) if disturbance == "none" else ARMINGS
+
+
+def write_table(table: HandoverTable, folder: Path, cell: Cell, split: Split, learner: int) -> Path:
+    """Write a table, complete and without snapshots, to `folder`."""
+    if (np.asarray(table.known()) == UNKNOWN).any():
+        raise ValueError(f"the table of {cell}, {split}, learner {learner}, has unknown outcomes: complete it first")
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / file_name(cell.disturbance, cell.severity, split, learner)
+    table.save(path, snapshots=False)
+    return path
