@@ -1,0 +1,121 @@
+"""Scores any latched rule on published handover tables: in seconds, exactly, and without a simulator."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from safeswitch import registry, suite
+from safeswitch.handover.panel import Calibration
+from safeswitch.handover.published import PublishedTables, armings_of
+from safeswitch.protocols import Arming, Calibrated
+from safeswitch.scoring.leaderboard import leaderboard
+from safeswitch.scoring.metrics import REFERENCES, TaskInfo
+from safeswitch.scoring.rows import latched_rows
+
+STEPS = ("margin", "delay")
+"""Scores that the tables give in control steps: they do not know how long a step is."""
+
+Calibrator = Callable[[PublishedTables, str, int, int, Arming], Calibrated]
+"""(tables, disturbance, severity, learner seed, arming) -> the calibrated method."""
+
+
+def find_tables(folder: Path) -> list[PublishedTables]:
+    """Tables of one task (`results/tables/cart-pole`), or of every task below a folder (`results/tables`)."""
+    if not folder.is_dir():
+        raise ValueError(f"--tables {folder}: there is no such folder; results/tables holds the committed ones")
+    if any(folder.glob("*.npz")):
+        return [PublishedTables.find(folder)]
+    found = [PublishedTables.find(below) for below in sorted(folder.iterdir()) if any(below.glob("*.npz"))]
+    if not found:
+        raise ValueError(f"--tables {folder}: neither it nor a folder in it holds handover tables (*.npz)")
+    return found
+
+
+def score_rule(tables: PublishedTables, name: str) -> pd.DataFrame:
+    """Leaderboard rows of a ready rule, `package.module:factory`; the factory takes no argument.
+
+    The rule is a `safeswitch.protocols.SwitchRule`. Once it names the expert it is taken at its word: the handover is
+    final.
+    """
+    rule = registry.find("method", name)()
+    if not (hasattr(rule, "update") or hasattr(rule, "handover_steps")):
+        advice = "it is a method: use --method" if hasattr(rule, "calibrate") else "see protocols.SwitchRule"
+        raise ValueError(f"{name} makes a {type(rule).__name__}, which has no update(step, signals); {advice}")
+    return _score(tables, {name: lambda *_: Calibrated(rule)}, name)
+
+
+def score_method(tables: PublishedTables, name: str) -> pd.DataFrame:
+    """Leaderboard rows of a method, calibrated on the published calibrate episodes as in the benchmark."""
+    method = registry.make_method(name)
+    if not method.latched:
+        raise ValueError(f"{name} gives control back: the tables are for latched rules, run it with bench")
+    signal = name.partition("@")[2]
+    measured = signal in _signals(tables)
+    names = dict.fromkeys([*REFERENCES, *([f"best@{signal}"] if measured else []), name])
+    return _score(tables, {each: _calibrator(each) for each in names}, name)
+
+
+def _calibrator(name: str) -> Calibrator:
+    """Calibration as in the benchmark: on the cell itself, or on the one that its thresholds come from."""
+
+    def calibrate(tables: PublishedTables, name_: str, severity: int, learner: int, arming: Arming) -> Calibrated:
+        task = suite.task(tables.task)
+        cell = next(each for each in task.cells if (each.disturbance, each.severity) == (name_, severity))
+        on = task.calibrated_on(cell)
+        if not tables.has(on.disturbance, on.severity, "calibrate", learner):
+            raise ValueError(
+                f"{tables.folder} has no calibrate episodes of {on} (learner {learner}): {name} cannot be calibrated. "
+                "Publish the tables again with `safeswitch bench --profile full`, or give a ready rule with --rule"
+            )
+        panel = tables.panel(on.disturbance, on.severity, "calibrate", learner, arming)
+        nominal = tables.load("none", 0, "calibrate", learner)
+        return registry.make_method(name).calibrate(Calibration(panel, nominal, seed=learner))
+
+    return calibrate
+
+
+def _signals(tables: PublishedTables) -> list[str]:
+    disturbance, severity = tables.cells[0]
+    return sorted(tables.load(disturbance, severity, "test", tables.learners[0]).signals)
+
+
+def _score(tables: PublishedTables, methods: dict[str, Calibrator], wanted: str) -> pd.DataFrame:
+    rows = list(_rows(tables, methods))
+    horizon = int(rows[0][1])
+    table = leaderboard(pd.concat([frame for frame, _ in rows]), {tables.task: TaskInfo(horizon, 1.0)})
+    table = table[table["method"] == wanted].reset_index(drop=True)
+    steps = {name: name.replace("_s", "_steps", 1) for name in table if name.startswith(tuple(f"{s}_s" for s in STEPS))}
+    return table.rename(columns=steps)
+
+
+def _rows(tables: PublishedTables, methods: dict[str, Calibrator]) -> Iterator[tuple[pd.DataFrame, int]]:
+    """Test episodes of every (cell, arming, learner, method), and T."""
+    for disturbance, severity in tables.cells:
+        for arming in armings_of(disturbance):
+            for learner in tables.learners:
+                test = tables.panel(disturbance, severity, "test", learner, arming)
+                for name, calibrate in methods.items():
+                    calibrated = calibrate(tables, disturbance, severity, learner, arming)
+                    yield (
+                        latched_rows(test, calibrated).assign(
+                            task=tables.task,
+                            disturbance=disturbance,
+                            severity=severity,
+                            protocol=arming,
+                            method=name,
+                            learner=learner,
+                            threshold=calibrated.threshold,
+                            tuning_episodes=calibrated.tuning_episodes,
+                            expert_queries=calibrated.expert_queries,
+                        ),
+                        test.table.horizon,
+                    )
+
+
+def records(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """Rows as plain values, for JSON; NaN becomes null when it is written."""
+    return table.to_dict("records")  # type: ignore[return-value]
