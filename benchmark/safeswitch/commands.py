@@ -8,7 +8,7 @@ from pathlib import Path
 
 import tyro
 from rich.markup import escape
-from rich.table import Table
+from rich.table import Column, Table
 
 from safeswitch import suite
 from safeswitch.console import console
@@ -42,16 +42,20 @@ class Score:
         if (self.rule is None) == (self.method is None):
             raise ValueError("score needs --rule package.module:factory or --method id, and not both")
         found = find_tables(self.tables)
-        tables = [score_rule(each, self.rule) if self.rule else score_method(each, self.method or "") for each in found]
+        scored = [score_rule(each, self.rule) if self.rule else score_method(each, self.method or "") for each in found]
+        rows, left_out = [row for each in scored for row in records(each.table)], sum((s.left_out for s in scored), [])
         if self.json:
-            _print_json([row for table in tables for row in records(table)])
+            _print_json({"scores": rows, "left_out": left_out})
             return
-        shown = Table("cell", "protocol", "episodes", *(f"{name} [95 %]" for name in SCORES), title=escape(self._name))
-        for row in (row for table in tables for row in records(table)):
+        names = [name for name in SCORES if any(row.get(f"{name}_lo") == row.get(f"{name}_lo") for row in rows)]
+        shown = Table(*_narrow("cell", "protocol"), "n", *names, title=escape(f"{self._name} [95 % interval]"))
+        for row in rows:
             cell = f"{row['task']}/{row['disturbance']}" + (f"-{row['severity']}" if row["severity"] else "")
-            scores = (_interval(row, name) for name in SCORES)
+            scores = (_interval(row, name) for name in names)
             shown.add_row(cell, row["protocol"], str(row["episodes"]), *scores)
         console.print(shown)
+        for reason in left_out:
+            console.print("[yellow]left out:[/]", escape(reason))
 
     @property
     def _name(self) -> str:
@@ -81,7 +85,8 @@ class Compare:
         if self.json:
             _print_json({"agree": not differ, "tables": [asdict(each) | {"verdict": each.verdict} for each in tables]})
             return int(differ)
-        summary = Table("table", "verdict", "same", "overlap", "differ", "only in A", "only in B", "of one folder only")
+        rest = ("same", "overlap", "differ", "only A", "only B", "tasks of one")
+        summary = Table(*_narrow("table", "verdict"), *rest)
         for table in tables:
             verdict = "same bytes" if table.identical else table.verdict
             lacking = (len(table.only_a), len(table.only_b))
@@ -133,12 +138,17 @@ class Reference:
         console.print(f"{folder}: {manifest['bytes'] / 1e6:.2f} MB, commit {manifest['commit']}")
 
 
+def _narrow(*names: str) -> list[Column]:
+    """Columns that are never broken."""
+    return [Column(name, no_wrap=True) for name in names]
+
+
 def _interval(row: dict, name: str) -> str:
     """A score with its interval; nothing where it does not apply."""
     value = row["return_mean" if name == "return" else name]
     if value != value:
         return ""
-    return f"{value:.3f} [{row[f'{name}_lo']:.3f}, {row[f'{name}_hi']:.3f}]"
+    return f"{value:.3f} \\[{row[f'{name}_lo']:.3f}, {row[f'{name}_hi']:.3f}]"
 
 
 def _print_json(value: object) -> None:

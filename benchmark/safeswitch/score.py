@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +11,14 @@ import pandas as pd
 
 from safeswitch import registry, suite
 from safeswitch.handover.panel import Calibration
-from safeswitch.handover.published import PublishedTables, armings_of
+from safeswitch.handover.published import AGAIN, PublishedTables, armings_of
 from safeswitch.protocols import Arming, Calibrated
 from safeswitch.scoring.leaderboard import leaderboard
 from safeswitch.scoring.metrics import REFERENCES, TaskInfo
 from safeswitch.scoring.rows import latched_rows
 
-STEPS = ("margin", "delay")
-"""Scores that the tables give in control steps: they do not know how long a step is."""
+IN_STEPS = ("margin_s", "delay_s")
+"""Scores that are given in control steps: the tables do not know how long a step is."""
 
 Calibrator = Callable[[PublishedTables, str, int, int, Arming], Calibrated]
 """(tables, disturbance, severity, learner seed, arming) -> the calibrated method."""
@@ -35,7 +36,15 @@ def find_tables(folder: Path) -> list[PublishedTables]:
     return found
 
 
-def score_rule(tables: PublishedTables, name: str) -> pd.DataFrame:
+@dataclass(frozen=True)
+class Scored:
+    """Leaderboard rows, and the cells that could not be scored, each with the reason."""
+
+    table: pd.DataFrame
+    left_out: list[str]
+
+
+def score_rule(tables: PublishedTables, name: str) -> Scored:
     """Leaderboard rows of a ready rule, `package.module:factory`; the factory takes no argument.
 
     The rule is a `safeswitch.protocols.SwitchRule`. Once it names the expert it is taken at its word: the handover is
@@ -48,7 +57,7 @@ def score_rule(tables: PublishedTables, name: str) -> pd.DataFrame:
     return _score(tables, {name: lambda *_: Calibrated(rule)}, name)
 
 
-def score_method(tables: PublishedTables, name: str) -> pd.DataFrame:
+def score_method(tables: PublishedTables, name: str) -> Scored:
     """Leaderboard rows of a method, calibrated on the published calibrate episodes as in the benchmark."""
     method = registry.make_method(name)
     if not method.latched:
@@ -68,8 +77,8 @@ def _calibrator(name: str) -> Calibrator:
         on = task.calibrated_on(cell)
         if not tables.has(on.disturbance, on.severity, "calibrate", learner):
             raise ValueError(
-                f"{tables.folder} has no calibrate episodes of {on} (learner {learner}): {name} cannot be calibrated. "
-                "Publish the tables again with `safeswitch bench --profile full`, or give a ready rule with --rule"
+                f"{tables.folder} has no calibrate episodes of {on} (learner {learner}): {name} cannot be calibrated: "
+                f"{AGAIN}, or give a ready rule with --rule"
             )
         panel = tables.panel(on.disturbance, on.severity, "calibrate", learner, arming)
         nominal = tables.load("none", 0, "calibrate", learner)
@@ -83,37 +92,42 @@ def _signals(tables: PublishedTables) -> list[str]:
     return sorted(tables.load(disturbance, severity, "test", tables.learners[0]).signals)
 
 
-def _score(tables: PublishedTables, methods: dict[str, Calibrator], wanted: str) -> pd.DataFrame:
-    rows = list(_rows(tables, methods))
-    horizon = int(rows[0][1])
-    table = leaderboard(pd.concat([frame for frame, _ in rows]), {tables.task: TaskInfo(horizon, 1.0)})
-    table = table[table["method"] == wanted].reset_index(drop=True)
-    steps = {name: name.replace("_s", "_steps", 1) for name in table if name.startswith(tuple(f"{s}_s" for s in STEPS))}
-    return table.rename(columns=steps)
-
-
-def _rows(tables: PublishedTables, methods: dict[str, Calibrator]) -> Iterator[tuple[pd.DataFrame, int]]:
-    """Test episodes of every (cell, arming, learner, method), and T."""
+def _score(tables: PublishedTables, methods: dict[str, Calibrator], wanted: str) -> Scored:
+    frames, left_out = [], []
     for disturbance, severity in tables.cells:
         for arming in armings_of(disturbance):
-            for learner in tables.learners:
-                test = tables.panel(disturbance, severity, "test", learner, arming)
-                for name, calibrate in methods.items():
-                    calibrated = calibrate(tables, disturbance, severity, learner, arming)
-                    yield (
-                        latched_rows(test, calibrated).assign(
-                            task=tables.task,
-                            disturbance=disturbance,
-                            severity=severity,
-                            protocol=arming,
-                            method=name,
-                            learner=learner,
-                            threshold=calibrated.threshold,
-                            tuning_episodes=calibrated.tuning_episodes,
-                            expert_queries=calibrated.expert_queries,
-                        ),
-                        test.table.horizon,
-                    )
+            try:
+                frames += list(_rows(tables, methods, disturbance, severity, arming))
+            except LookupError as error:  # an outcome that the rule asks for is unknown
+                left_out.append(f"{tables.task}/{disturbance}-{severity}, {arming}: {error}; {AGAIN}")
+    if not frames:
+        raise ValueError("no cell can be scored: " + " | ".join(left_out))
+    horizon = tables.load(*tables.cells[0], "test", tables.learners[0]).horizon
+    table = leaderboard(pd.concat(frames), {tables.task: TaskInfo(horizon, 1.0)})
+    table = table[table["method"] == wanted].reset_index(drop=True)
+    names = {column: column.replace("_s", "_steps", 1) for column in table if column.startswith(IN_STEPS)}
+    return Scored(table.rename(columns=names), left_out)
+
+
+def _rows(
+    tables: PublishedTables, methods: dict[str, Calibrator], disturbance: str, severity: int, arming: Arming
+) -> Iterator[pd.DataFrame]:
+    """Test episodes of one cell and arming, for every learner and method."""
+    for learner in tables.learners:
+        test = tables.panel(disturbance, severity, "test", learner, arming)
+        for name, calibrate in methods.items():
+            calibrated = calibrate(tables, disturbance, severity, learner, arming)
+            yield latched_rows(test, calibrated).assign(
+                task=tables.task,
+                disturbance=disturbance,
+                severity=severity,
+                protocol=arming,
+                method=name,
+                learner=learner,
+                threshold=calibrated.threshold,
+                tuning_episodes=calibrated.tuning_episodes,
+                expert_queries=calibrated.expert_queries,
+            )
 
 
 def records(table: pd.DataFrame) -> list[dict[str, Any]]:

@@ -31,6 +31,10 @@ def file_name(disturbance: str, severity: int, split: Split, learner: int) -> st
     return f"{disturbance}-{severity}-{split}-learner{learner}.npz"
 
 
+AGAIN = "publish the tables again with `safeswitch bench --profile full`"
+"""Remedy of tables that lack something."""
+
+
 @dataclass(frozen=True)
 class PublishedTables:
     """The tables of one task in a folder.
@@ -101,16 +105,19 @@ class PublishedTables:
         return table
 
     def panel(self, disturbance: str, severity: int, split: Split, learner: int, arming: Arming) -> Panel:
-        """Episodes of a cell under an arming, every outcome known; under `start` with their undisturbed twins."""
+        """Episodes of a cell under an arming; under `start` with their undisturbed twins."""
         table = self.load(disturbance, severity, split, learner)
         nominal = self.load("none", 0, split, learner) if arming == "start" and disturbance != "none" else None
-        panel = panel_of(table, nominal, arming)
-        missing = int((panel.table.known() == UNKNOWN).sum())
-        if missing:
+        return panel_of(table, nominal, arming)
+
+    def complete_panel(self, disturbance: str, severity: int, split: Split, learner: int, arming: Arming) -> Panel:
+        """The same, refused where an outcome is unknown."""
+        panel = self.panel(disturbance, severity, split, learner, arming)
+        known = panel.table.known()
+        if missing := int((known == UNKNOWN).sum()):
             raise ValueError(
-                f"{missing} of {panel.table.known().size} outcomes of {self.task}/{disturbance}-{severity} "
-                f"(learner {learner}, {split}) are unknown, and there is no simulator here to compute them: publish "
-                "the tables again with `safeswitch bench --profile full`"
+                f"{missing} of {known.size} outcomes of {self.task}/{disturbance}-{severity} (learner {learner}, "
+                f"{split}) are unknown, and there is no simulator here to compute them: {AGAIN}"
             )
         return panel
 

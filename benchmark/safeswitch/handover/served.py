@@ -102,7 +102,7 @@ def _panel(
     if split == "calibrate" and cell.tag == "held-out":
         raise ValueError(f"cell {cell} is held out: train on {task.paper_cell} and score it here with split='test'")
     if tables is not None:
-        return PublishedTables.find(tables).panel(cell.disturbance, cell.severity, split, learner, arming)
+        return PublishedTables.find(tables).complete_panel(cell.disturbance, cell.severity, split, learner, arming)
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}")
     from safeswitch.reference import reference_table
