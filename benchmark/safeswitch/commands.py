@@ -47,19 +47,20 @@ class Score:
         if self.json:
             _print_json({"scores": rows, "left_out": left_out})
             return
-        names = [name for name in SCORES if any(row.get(f"{name}_lo") == row.get(f"{name}_lo") for row in rows)]
-        shown = Table(*_narrow("cell", "protocol"), "n", *names, title=escape(f"{self._name} [95 % interval]"))
-        for row in rows:
-            cell = f"{row['task']}/{row['disturbance']}" + (f"-{row['severity']}" if row["severity"] else "")
-            scores = (_interval(row, name) for name in names)
-            shown.add_row(cell, row["protocol"], str(row["episodes"]), *scores)
-        console.print(shown)
+        for task in dict.fromkeys(row["task"] for row in rows):
+            console.print(self._table(task, [row for row in rows if row["task"] == task]))
         for reason in left_out:
             console.print("[yellow]left out:[/]", escape(reason))
 
-    @property
-    def _name(self) -> str:
-        return self.rule or self.method or ""
+    def _table(self, task: str, rows: list[dict]) -> Table:
+        """One line a cell and protocol; scores that apply nowhere have no column."""
+        names = [name for name in SCORES if any(_applies(row, name) for row in rows)]
+        columns = [Column(name, no_wrap=True) for name in ("cell", *names)]
+        table = Table(*columns, title=escape(f"{task}: {self.rule or self.method}"), caption="with 95 % intervals")
+        for row in rows:
+            cell = row["disturbance"] + (f"-{row['severity']}" if row["severity"] else "")
+            table.add_row(f"{cell}\n{row['protocol']}, n={row['episodes']}", *(_interval(row, name) for name in names))
+        return table
 
 
 @dataclass
@@ -85,14 +86,15 @@ class Compare:
         if self.json:
             _print_json({"agree": not differ, "tables": [asdict(each) | {"verdict": each.verdict} for each in tables]})
             return int(differ)
-        rest = ("same", "overlap", "differ", "only A", "only B", "tasks of one")
-        summary = Table(*_narrow("table", "verdict"), *rest)
+        headings = ("table", "verdict", "same", "overlap", "differ", "one side")
+        summary = Table(*(Column(name, no_wrap=True) for name in headings))
         for table in tables:
             verdict = "same bytes" if table.identical else table.verdict
-            lacking = (len(table.only_a), len(table.only_b))
-            counts = (str(each) for each in (*table.counts.values(), *lacking))
-            summary.add_row(table.name, verdict, *counts, ", ".join(table.tasks))
+            counts = (str(each) for each in (*table.counts.values(), len(table.only_a) + len(table.only_b)))
+            summary.add_row(table.name.removesuffix(".csv"), verdict, *counts)
         console.print(summary)
+        if tasks := sorted({task for table in tables for task in table.tasks}):
+            console.print(f"not compared, because only one folder ran it: {', '.join(tasks)}")
         self._print_differences(tables)
         return int(differ)
 
@@ -138,17 +140,17 @@ class Reference:
         console.print(f"{folder}: {manifest['bytes'] / 1e6:.2f} MB, commit {manifest['commit']}")
 
 
-def _narrow(*names: str) -> list[Column]:
-    """Columns that are never broken."""
-    return [Column(name, no_wrap=True) for name in names]
+def _applies(row: dict, name: str) -> bool:
+    value = row["return_mean" if name == "return" else name]
+    return bool(value == value)  # not NaN
 
 
 def _interval(row: dict, name: str) -> str:
-    """A score with its interval; nothing where it does not apply."""
-    value = row["return_mean" if name == "return" else name]
-    if value != value:
+    """A score above its interval; nothing where it does not apply."""
+    if not _applies(row, name):
         return ""
-    return f"{value:.3f} \\[{row[f'{name}_lo']:.3f}, {row[f'{name}_hi']:.3f}]"
+    value = row["return_mean" if name == "return" else name]
+    return f"{value:.3f}\n{row[f'{name}_lo']:.2f} to {row[f'{name}_hi']:.2f}"
 
 
 def _print_json(value: object) -> None:
