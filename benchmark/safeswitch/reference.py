@@ -1,23 +1,27 @@
-"""Reference learners: the weights of one learner a task, shipped with the package that the learner comes from.
+"""Reference learners: one trained learner a task, shipped with the package that the learner comes from.
 
-`safeswitch reference --task cart-pole` makes them from the suite's own run (demonstrations and training of a profile,
-learner seed 0) and writes a manifest beside them. Handover tables of a reference learner are recorded when they are
-first needed and kept in the cache folder, `$SAFESWITCH_CACHE` or `~/.cache/safeswitch`, under a hash of the weights,
-of the code and of the libraries.
+`safeswitch reference --task cart-pole` makes it from the suite's own run (demonstrations and training of a profile,
+learner seed 0): its weights, its handover tables in the paper's cell and undisturbed on the calibrate and the test
+split, and a manifest. Tables of other cells are recorded from the weights when they are first needed, and kept in the
+cache folder, `$SAFESWITCH_CACHE` or `~/.cache/safeswitch`, under a hash of the weights, the code and the libraries.
 """
 
 from __future__ import annotations
 
+import hashlib
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from joblib import Parallel, cpu_count, delayed, parallel_config
 
 from safeswitch import registry
 from safeswitch.console import Progress
 from safeswitch.files import load_json, save_json
+from safeswitch.handover.published import PublishedTables, file_name, write_table
+from safeswitch.handover.served import SPLITS
 from safeswitch.handover.table import HandoverTable, concatenate
 from safeswitch.stages import Job, complete_job, table_jobs
 from safeswitch.store import Key, Store
@@ -29,6 +33,8 @@ if TYPE_CHECKING:
 
 SEED = 0
 """Learner seed of the reference weights."""
+EPISODES = 100
+"""Episodes of each shipped table: as many as the standard profile has."""
 MANIFEST, LEARNER = "manifest.json", "learner"
 
 
@@ -79,22 +85,34 @@ def reference(task: Task) -> Reference:
     return Reference(str(folder.parent), SEED, Key(task.name, {}), weights=weights)
 
 
-def reference_table(task: Task, cell: Cell, split: Split, episodes: int, store: Store | None = None) -> HandoverTable:
-    """The complete handover table of the reference learner; recorded with a progress bar where the cache lacks it.
+def reference_table(task: Task, cell: Cell, split: Split, episodes: int = EPISODES) -> HandoverTable:
+    """The complete handover table of the reference learner: the shipped one, or recorded where it does not suffice."""
+    learner = reference(task)
+    path = reference_folder(task) / file_name(cell.disturbance, cell.severity, split, SEED)
+    if path.is_file():
+        shipped = PublishedTables.find(path.parent).load(cell.disturbance, cell.severity, split, SEED)
+        if len(shipped) >= episodes:
+            return shipped.take(np.arange(episodes))
+    return record(learner, task, cell, split, episodes)
+
+
+def record(
+    learner: Reference, task: Task, cell: Cell, split: Split, episodes: int, store: Store | None = None
+) -> HandoverTable:
+    """The same, recorded with a progress bar where the cache lacks it.
 
     Args:
+        learner: the reference learner.
         task: the task; signals that the reference learner cannot give are left out.
         cell: any of its cells.
         split: of the episode seeds.
         episodes: the first so many of them.
         store: cache of tables; the default is in the cache folder.
     """
-    from dataclasses import replace
-
     from safeswitch.expert.codegen import cache_dir
 
     store = store or Store(cache_dir() / "reference")
-    learner, task = reference(task), replace(task, signals=reference_signals(task))
+    task = replace(task, signals=reference_signals(task))
     recorded = table_jobs(store, task, cell, split, episodes, learner)
     completed = [complete_job(store, task, cell, (job.key,)) for job in recorded]
     label = f"{cell}: recording {episodes} {split} episodes of the reference learner, once"
@@ -121,7 +139,7 @@ def _run(root: str, jobs: tuple[Job, ...]) -> str:
 
 
 def make_reference(run: Run, folder: Path | None = None) -> tuple[Path, dict[str, Any]]:
-    """Write the reference weights of a run's task: its learner of seed 0, and a manifest that says where it is from.
+    """Write the reference learner of a run's task, its tables, and a manifest that says where they are from.
 
     Returns:
         The folder and the manifest.
@@ -132,18 +150,27 @@ def make_reference(run: Run, folder: Path | None = None) -> tuple[Path, dict[str
     folder = folder or reference_folder(run.task)
     job = run.learners[SEED]
     target = folder / LEARNER
-    shutil.rmtree(target, ignore_errors=True)
+    shutil.rmtree(folder, ignore_errors=True)
     shutil.copytree(run.store.folder(job.key) / LEARNER, target)
+    weights = load_json(target / "config.json")["weights_sha256"]
+    learner = Reference(str(folder.parent), SEED, Key(folder.name, {}), weights=weights)
+    tables = {}
+    for cell in (run.task.none_cell, run.task.paper_cell):
+        for split in SPLITS:
+            path = write_table(record(learner, run.task, cell, split, EPISODES, run.store), folder, cell, split, SEED)
+            tables[path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
     manifest = {
         "task": run.task.name,
         "learner": run.task.learner,
         "learner_seed": SEED,
         "profile": run.profile.name,
         "commit": commit,
-        "weights_sha256": load_json(target / "config.json")["weights_sha256"],
+        "weights_sha256": weights,
+        "tables_sha256": tables,
+        "episodes": EPISODES,
         "store_keys": {"demonstrations": run.demonstrations.key, "learner": job.key},
         "versions": {name: installed(name) for name in LIBRARIES},
-        "bytes": sum(path.stat().st_size for path in target.iterdir()),
+        "bytes": sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()),
     }
     save_json(folder / MANIFEST, manifest)
     return folder, manifest

@@ -16,9 +16,7 @@ from safeswitch.suite import Cell, Split, Task
 from safeswitch.suite import task as find_task
 
 SPLITS: tuple[Split, ...] = ("calibrate", "test")
-"""Splits that a rule may see: `calibrate` to learn on, `test` to be scored on. The learner was trained on others."""
-EPISODES = 100
-"""Episodes of a cell that are recorded with the reference learner: as many as the standard profile has."""
+"""Splits that a policy may see: `calibrate` to learn on, `test` to be scored on. The learner was trained on others."""
 SIGNALS = ("epistemic", "aleatoric", "total")
 """Signals that are observed unless others are named: the paper's."""
 
@@ -32,7 +30,7 @@ def make(
     phi: float = PHI,
     signals: Sequence[str] = SIGNALS,
     history: int = HISTORY,
-    episodes: int = EPISODES,
+    episodes: int = 100,
     tables: str | Path | None = None,
     learner: int = 0,
 ) -> HandoverEnv:
@@ -47,9 +45,10 @@ def make(
         phi: reward of success, in units of a whole episode driven by the learner.
         signals: ids of the observed signals.
         history: steps of each signal in an observation.
-        episodes: per cell, for the reference learner.
+        episodes: of the reference learner, per cell; up to 100 are shipped for the paper's cell and `none`.
         tables: folder of published tables of this task, such as `results/tables/cart-pole`. Where it is left out the
-            reference learner that is shipped with the package is recorded once, which takes a minute or more.
+            reference learner serves, that is shipped with the package: in the paper's cell and in `none` at once, in
+            any other cell after its episodes were recorded once, which takes minutes.
         learner: seed of the learner in `tables`.
     """
     cell = (task, disturbance, severity, arming, split, episodes, None if tables is None else str(tables), learner)
