@@ -140,7 +140,7 @@ def _train(
 
 @contextmanager
 def _alone() -> Iterator[None]:
-    """One thread, so that sums are taken in one order; the global generators, which the library seeds, stay as before."""
+    """One thread, so that sums are taken in one order; global generators, which the library seeds, stay as before."""
     import torch
 
     threads, numpy_state, python_state = torch.get_num_threads(), np.random.get_state(), random.getstate()
