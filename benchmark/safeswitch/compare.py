@@ -133,7 +133,8 @@ def _ranges(frame: pd.DataFrame, key: list[str]) -> pd.DataFrame:
 
 
 def _keyed(frame: pd.DataFrame, key: list[str], path: Path) -> pd.DataFrame:
-    keyed = frame.assign(**{column: frame[column].fillna("").astype(str) for column in key}).set_index(key)
+    names = {column: ["" if value != value else str(value) for value in frame[column]] for column in key}  # NaN: ""
+    keyed = frame.assign(**names).set_index(key)
     if keyed.index.has_duplicates:
         raise ValueError(f"{path} has two rows of {keyed.index[keyed.index.duplicated()][0]}")
     return keyed

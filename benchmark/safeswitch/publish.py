@@ -16,8 +16,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
+from rich.markup import escape
 
 from safeswitch import pictures, registry
+from safeswitch.console import console
 from safeswitch.files import load_json, save_frame, save_json
 from safeswitch.handover.published import write_table
 from safeswitch.handover.table import HandoverTable
@@ -29,7 +31,7 @@ from safeswitch.scoring.signal_quality import signal_table
 from safeswitch.scoring_stages import calibration_of, protocols_of
 from safeswitch.stages import Job, complete_job, load_rows, source_of
 from safeswitch.store import Store
-from safeswitch.suite import SPLIT_SIZE, SPLITS, TASKS, Cell, Split, Task, methods
+from safeswitch.suite import SPLIT_SIZE, SPLITS, TASKS, Cell, Split, Task, left_out, methods
 
 if TYPE_CHECKING:
     from safeswitch.pipeline import Run
@@ -49,6 +51,8 @@ def publish(run: Run, folder: Path | None = None) -> Path:
     folder = (folder or default_folder(run.profile.name)).absolute()
     started = time.time()
     commit = git_commit()  # before anything is written into the checkout
+    for reason in left_out().values():
+        console.print(f"[yellow]{escape(reason)}[/]")
     scores, spread, figures = run.scores, run.spread, run.figures
     folder.mkdir(parents=True, exist_ok=True)
     for name in TABLES:

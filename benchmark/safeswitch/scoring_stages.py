@@ -22,8 +22,8 @@ from safeswitch.protocols import Arming
 from safeswitch.scoring.rows import episode_rows, latched_rows
 from safeswitch.scoring.signal_quality import SignalQuality, frame_quality, signal_quality
 from safeswitch.stages import CellTables, Job, concat, load_table, make_env, only_seen, recorded_table, source_of
-from safeswitch.store import Store
-from safeswitch.suite import Cell, Task, methods
+from safeswitch.store import LIBRARIES, Store
+from safeswitch.suite import OPTIONAL, Cell, Task, methods
 from safeswitch.trained import Trained
 
 if TYPE_CHECKING:
@@ -40,7 +40,8 @@ def episodes_job(store: Store, task: Task, cell: Cell, trained: Trained, tables:
     keys = [*tables.calibrate, *tables.calibrate_nominal, *tables.test, *tables.test_nominal]
     rules = {source_of("method", name.partition("@")[0]) for name in ids}
     code = ["safeswitch.handover.panel", "safeswitch.scoring.rows", *sorted(rules)]
-    key = store.key("episodes", settings, [*trained.keys, *keys], code)
+    optional = [module.replace("_", "-") for name, (module, _) in OPTIONAL.items() if name in ids]
+    key = store.key("episodes", settings, [*trained.keys, *keys], code, [*LIBRARIES, *optional])
     arguments = (str(store.root), task, cell, trained, tables, give_back)
     return Job("episodes", f"{cell} learner {trained.seed}", key, _score_episodes, arguments)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
@@ -225,12 +226,24 @@ CONTROLS = ("random", "periodic", "shuffled@total")
 QUANTILES = ("fixed-q95", "fixed-q99", "fixed-q999", "fixed-epmax95")
 VALUES = ("fixed-0.05@total", "fixed-0.1@total", "fixed-0.2@total", "fixed-0.4@total")
 CEM_VARIANTS = ("cem-literal@total", "cem-single@total", "cem-high@total", "cem-low@total")
+OPTIONAL: Mapping[str, tuple[str, str]] = {"ppo@signals": ("stable_baselines3", "rl")}
+"""Methods that need a library which is not installed by default: the module, and the extra that brings it."""
 PER_SIGNAL = ("cem", "grid", "random-search", *QUANTILES, "best")
 
 
 def methods(signals: tuple[str, ...]) -> tuple[str, ...]:
-    """Every method of the comparison on these signals."""
-    return (*BOUNDS, *CONTROLS, *VALUES, *CEM_VARIANTS, *_methods(signals, PER_SIGNAL))
+    """Every method of the comparison on these signals; optional ones where their library is installed."""
+    optional = (name for name in OPTIONAL if name not in left_out())
+    return (*BOUNDS, *CONTROLS, *VALUES, *CEM_VARIANTS, *_methods(signals, PER_SIGNAL), *optional)
+
+
+def left_out() -> dict[str, str]:
+    """Optional methods whose library is not installed, each with its remedy."""
+    return {
+        name: f"{name} is left out: it needs {module.replace('_', '-')}, pip install 'safeswitch[{extra}]'"
+        for name, (module, extra) in OPTIONAL.items()
+        if find_spec(module) is None
+    }
 
 
 @dataclass(frozen=True)
