@@ -10,12 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from safeswitch import cli, suite
+from micro import MICRO
+from safeswitch import cli, publish, suite
 from safeswitch.handover.episode import NeverSwitch
 from safeswitch.handover.panel import Calibration
 from safeswitch.handover.published import PublishedTables, panel_of, write_table
+from safeswitch.pipeline import Run
 from safeswitch.score import find_tables, score_method, score_rule
 from safeswitch.scoring.leaderboard import read_csv
+from safeswitch.store import Store
 from safeswitch_baselines.rules.base import ThresholdRule
 from safeswitch_baselines.rules.cem import CEM
 from synthetic import cliff_table
@@ -134,3 +137,20 @@ def test_json_and_folders(folder: Path, tmp_path: Path, capsys: Any) -> None:
     for bad in (tmp_path, tmp_path / "missing"):
         with pytest.raises(ValueError, match="tables"):
             find_tables(bad)
+
+
+@pytest.mark.slow
+def test_what_a_run_publishes_gives_its_own_leaderboard(tmp_path: Path) -> None:
+    """Tables of both splits, complete, from which a calibrated method earns what the run says it earned."""
+    run = Run(TASK, replace(MICRO, cells=3, tables=True), Store(tmp_path / "store"), 1)
+    publish._write_tables(run, tmp_path / "cart-pole")
+    tables = PublishedTables.find(tmp_path / "cart-pole")
+    assert len(tables.files) == 5 and tables.cells == [("cart-mass", 3), ("none", 0), ("repaint", 3)]
+    board = read_csv(run.store.folder(run.scores.key) / "leaderboard.csv")
+    for method in ("cem@total", "fixed-q95@epistemic", "oracle-hindsight"):
+        scored = score_method(tables, method)
+        assert scored.left_out == [] and len(scored.table) == 5
+        expected = board[board["method"] == method]
+        both = scored.table.merge(expected, on=["disturbance", "severity", "protocol"], suffixes=("", "_run"))
+        for name in ("return_mean", "return_lo", "return_hi", "success", "autonomy", "threshold"):
+            np.testing.assert_allclose(both[name], both[f"{name}_run"], rtol=1e-5, err_msg=name)
