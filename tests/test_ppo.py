@@ -53,7 +53,7 @@ def test_the_scale_standardises_logarithms() -> None:
 def test_without_the_extra_it_is_left_out_and_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(suite, "find_spec", lambda module: None)
     assert "ppo@signals" not in suite.methods(("total",))
-    assert "pip install 'safeswitch[rl]'" in suite.left_out()["ppo@signals"]
+    assert "pip install 'safeswitch[rl]'" in suite.without_extra()["ppo@signals"]
     monkeypatch.setitem(__import__("sys").modules, "stable_baselines3", None)
     with pytest.raises(ValueError, match=r"safeswitch\[rl\]"):
         PPORule("signals").calibrate(calibration(cliff_table(0.3), cliff_table(0.3, disturbed=False), "onset"))

@@ -18,8 +18,8 @@ from safeswitch.scoring.leaderboard import read_csv
 KEY = ["task", "disturbance", "severity", "protocol", "method", "signal", "reference", "learner", "calibrated_on"]
 """Columns that say which row it is, those that a table has."""
 TABLES = (
-    "leaderboard.csv", "signals.csv", "comparisons.csv", "paper_literal_leaderboard.csv", "paper_literal_signals.csv",
-    "cem_seeds.csv",
+    "leaderboard.csv", "left_out.csv", "signals.csv", "comparisons.csv", "paper_literal_leaderboard.csv",
+    "paper_literal_signals.csv", "cem_seeds.csv",
 )  # fmt: skip
 SAME, OVERLAP, DIFFERS = "same", "overlap", "differs"
 

@@ -31,7 +31,7 @@ from safeswitch.stages import (
     table_jobs,
 )
 from safeswitch.store import Store
-from safeswitch.suite import Cell, Profile, Split, Task
+from safeswitch.suite import Cell, Profile, Split, Task, others
 from safeswitch.trained import Trained, fitted_signals, needs_members, with_signals_of
 
 PAPER = ("epistemic", "aleatoric", "total")
@@ -143,6 +143,7 @@ class Run:
                 keys[seed, none, "calibrate"],
                 keys[seed, cell, "test"],
                 keys[seed, none, "test"],
+                tuple((other, keys[seed, other, "calibrate"]) for other in others(cell, cells)),
             )
             for seed in range(len(self.learners))
             for cell in cells

@@ -181,7 +181,8 @@ class Calibrated:
     """A method after calibration in one (learner, cell, arming).
 
     Attributes:
-        rule: the switch rule, ready to run.
+        rule: the switch rule, ready to run; None where the method cannot have what it asks for in this cell (for
+            example a share of expert steps): it is then left out there.
         threshold: its threshold in the signal's units; NaN where it has none.
         tuning_episodes: episodes spent on calibration (candidates x episodes for searches).
         expert_queries: expert-driven steps spent on calibration.

@@ -44,6 +44,10 @@ class Scored:
     left_out: list[str]
 
 
+class _Unattainable(Exception):
+    """A method has no rule in a cell, such as one that asks for an expert share that no threshold gives."""
+
+
 def score_rule(tables: PublishedTables, name: str) -> Scored:
     """Leaderboard rows of a ready rule, `package.module:factory`; the factory takes no argument.
 
@@ -100,6 +104,8 @@ def _score(tables: PublishedTables, methods: dict[str, Calibrator], wanted: str)
                 frames += list(_rows(tables, methods, disturbance, severity, arming))
             except LookupError as error:  # an outcome that the rule asks for is unknown
                 left_out.append(f"{tables.task}/{disturbance}-{severity}, {arming}: {error}; {AGAIN}")
+            except _Unattainable as error:
+                left_out.append(f"{tables.task}/{disturbance}-{severity}, {arming}: {error}")
     if not frames:
         raise ValueError("no cell can be scored: " + " | ".join(left_out))
     horizon = tables.load(*tables.cells[0], "test", tables.learners[0]).horizon
@@ -117,6 +123,8 @@ def _rows(
         test = tables.panel(disturbance, severity, "test", learner, arming)
         for name, calibrate in methods.items():
             calibrated = calibrate(tables, disturbance, severity, learner, arming)
+            if calibrated.rule is None:
+                raise _Unattainable(f"{name} cannot have what it asks for here (learner {learner})")
             yield latched_rows(test, calibrated).assign(
                 task=tables.task,
                 disturbance=disturbance,

@@ -46,9 +46,14 @@ class Cell:
         return f"{self.task}/{self.disturbance}" + (f"-{self.severity}" if self.severity else "")
 
     @property
-    def complete(self) -> bool:
-        """Whether every outcome is computed in advance: cells that many rules, and published tables, come back to."""
-        return self.tag == "none" or (self.tag == "paper" and self.severity == 3)
+    def left_out(self) -> bool:
+        """Whether thresholds are also calibrated on the other disturbances: severity 3 of what does harm."""
+        return self.severity == 3 and self.tag in ("paper", "other")
+
+    def complete(self, split: Split) -> bool:
+        """Whether every outcome is computed in advance: tables that many rules, and cells, come back to."""
+        often = self.left_out and split == "calibrate"
+        return self.tag == "none" or (self.tag == "paper" and self.severity == 3) or often
 
     @property
     def env_kwargs(self) -> dict[str, Any]:
@@ -119,6 +124,14 @@ class Task:
         return self.paper_cell if cell.tag in ("none", "benign", "held-out") else cell
 
 
+def others(cell: Cell, cells: tuple[Cell, ...]) -> tuple[Cell, ...]:
+    """Those of `cells` that thresholds come from when the disturbance of `cell` is left out; none for cells that have
+    no such rows.
+    """
+    found = tuple(each for each in cells if each.left_out and each.disturbance != cell.disturbance)
+    return found if cell.left_out else ()
+
+
 def _cart_pole_cells() -> tuple[Cell, ...]:
     name, others = "cart-pole", ("pole-length", "motor-gain", "push", "joint-friction", "sensor-bias", "sensor-noise")
     return (
@@ -167,7 +180,17 @@ TASKS: dict[str, Task] = {
             "noise": {"low": 0.23, "high": 0.23, "correlated_fraction": 1.0, "correlation": 0.5},
         },
         dataset="safeswitch/cart-pole/expert-v0",
-        signals=("epistemic", "aleatoric", "total", "total-mean3", "total-mean5", "epistemic-mean3", "epistemic-mean5"),
+        signals=(
+            "epistemic",
+            "aleatoric",
+            "total",
+            "total-mean3",
+            "total-mean5",
+            "epistemic-mean3",
+            "epistemic-mean5",
+            "mahalanobis",
+            "discrepancy",
+        ),
         cells=_cart_pole_cells(),
         modules=("safeswitch.tasks.cart_pole", "safeswitch.expert.cart_pole_model"),
         assets=("cart_pole", "common"),
@@ -193,6 +216,7 @@ TASKS: dict[str, Task] = {
             "mahalanobis",
             "mahalanobis-mean3",
             "rnd",
+            "discrepancy",
         ),
         cells=_cart_pole_image_cells(),
         modules=(
@@ -221,23 +245,34 @@ def _methods(signals: tuple[str, ...], rules: tuple[str, ...]) -> tuple[str, ...
     return tuple(f"{rule}@{signal}" for signal in signals for rule in rules)
 
 
-BOUNDS = ("learner", "expert", "oracle-onset", "oracle-hindsight", "timer")
-CONTROLS = ("random", "periodic", "shuffled@total")
+SHARES = (5, 10, 20, 40)
+"""Shares of expert steps at which all signals are compared [%]."""
+BOUNDS = ("learner", "expert", "oracle-onset", "oracle-hindsight", "simplex", "timer")
+CONTROLS = ("random", "periodic", "shuffled@total", *(f"random-{share}" for share in SHARES))
 QUANTILES = ("fixed-q95", "fixed-q99", "fixed-q999", "fixed-epmax95")
 VALUES = ("fixed-0.05@total", "fixed-0.1@total", "fixed-0.2@total", "fixed-0.4@total")
 CEM_VARIANTS = ("cem-literal@total", "cem-single@total", "cem-high@total", "cem-low@total")
 OPTIONAL: Mapping[str, tuple[str, str]] = {"ppo@signals": ("stable_baselines3", "rl")}
 """Methods that need a library which is not installed by default: the module, and the extra that brings it."""
-PER_SIGNAL = ("cem", "grid", "random-search", *QUANTILES, "best")
+MONITORS = ("conformal", "conformal-band", "patience")
+MATCHED = tuple(f"share-{share}" for share in SHARES)
+PER_SIGNAL = ("cem", "grid", "random-search", *QUANTILES, *MONITORS, *MATCHED, "best")
+OURS = ("cem-vector", "cem-vector-return")
+GIVE_BACK = ("cem-two@total", "cem-two@epistemic", "safe-dagger@discrepancy", "lazy@discrepancy")
+DOUBTS = ("epistemic", "ensemble")
+"""Signals that are a doubt in the sense of EnsembleDAgger and a novelty in that of ThriftyDAgger."""
 
 
 def methods(signals: tuple[str, ...]) -> tuple[str, ...]:
     """Every method of the comparison on these signals; optional ones where their library is installed."""
-    optional = (name for name in OPTIONAL if name not in left_out())
-    return (*BOUNDS, *CONTROLS, *VALUES, *CEM_VARIANTS, *_methods(signals, PER_SIGNAL), *optional)
+    doubts = tuple(signal for signal in DOUBTS if signal in signals)
+    give_back = [method for method in GIVE_BACK if method.partition("@")[2] in signals]
+    give_back += _methods(doubts, ("ensemble-dagger", "thrifty"))
+    optional = [method for method in OPTIONAL if method not in without_extra()]
+    return (*BOUNDS, *CONTROLS, *VALUES, *CEM_VARIANTS, *OURS, *_methods(signals, PER_SIGNAL), *give_back, *optional)
 
 
-def left_out() -> dict[str, str]:
+def without_extra() -> dict[str, str]:
     """Optional methods whose library is not installed, each with its remedy."""
     return {
         name: f"{name} is left out: it needs {module.replace('_', '-')}, pip install 'safeswitch[{extra}]'"
