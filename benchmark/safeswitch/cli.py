@@ -1,4 +1,4 @@
-"""The command line of the suite: `safeswitch --help` lists the commands."""
+"""When should a learned controller hand control back to an expert? Run, score and compare switch rules."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ class Scored:
     left_out: list[str]
 
 
-class _Unattainable(Exception):
+class _UnattainableError(Exception):
     """A method has no rule in a cell, such as one that asks for an expert share that no threshold gives."""
 
 
@@ -104,7 +104,7 @@ def _score(tables: PublishedTables, methods: dict[str, Calibrator], wanted: str)
                 frames += list(_rows(tables, methods, disturbance, severity, arming))
             except LookupError as error:  # an outcome that the rule asks for is unknown
                 left_out.append(f"{tables.task}/{disturbance}-{severity}, {arming}: {error}; {AGAIN}")
-            except _Unattainable as error:
+            except _UnattainableError as error:
                 left_out.append(f"{tables.task}/{disturbance}-{severity}, {arming}: {error}")
     if not frames:
         raise ValueError("no cell can be scored: " + " | ".join(left_out))
@@ -124,7 +124,7 @@ def _rows(
         for name, calibrate in methods.items():
             calibrated = calibrate(tables, disturbance, severity, learner, arming)
             if calibrated.rule is None:
-                raise _Unattainable(f"{name} cannot have what it asks for here (learner {learner})")
+                raise _UnattainableError(f"{name} cannot have what it asks for here (learner {learner})")
             yield latched_rows(test, calibrated).assign(
                 task=tables.task,
                 disturbance=disturbance,
