@@ -106,7 +106,7 @@ def _compare(name: str, first: Path, second: Path) -> TableComparison:
     same = _equal(left.loc[both, shared], right.loc[both, shared])
     found = [_differences(left.loc[both], right.loc[both], score, ends) for score, ends in scores.items()]
     for position, row in enumerate(both):
-        here = [each[position] for each in found if each[position] is not None]
+        here = [each for column in found if (each := column[position]) is not None]
         differences += [Difference(_text(row), each.score, each.a, each.b) for each in here]
         counts[SAME if same[position] else DIFFERS if here else OVERLAP] += 1
     return TableComparison(
