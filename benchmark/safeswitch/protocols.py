@@ -153,7 +153,10 @@ class SignalContext:
 
 @runtime_checkable
 class SwitchRule(Protocol):
-    """Decides the driver of each step from the signals, and from nothing else."""
+    """Decides the driver of each step from the signals, and from nothing else.
+
+    A rule may have `reads`, ids of the signals that it looks at: in plain episodes the others are then not computed.
+    """
 
     def reset(self, seed: int) -> None:
         """Start an episode."""

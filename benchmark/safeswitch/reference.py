@@ -88,9 +88,9 @@ def reference(task: Task) -> Reference:
 def reference_table(task: Task, cell: Cell, split: Split, episodes: int = EPISODES) -> HandoverTable:
     """The complete handover table of the reference learner: the shipped one, or recorded where it does not suffice."""
     learner = reference(task)
-    path = reference_folder(task) / file_name(cell.disturbance, cell.severity, split, SEED)
+    path = reference_folder(task) / file_name(cell.label, cell.severity, split, SEED)
     if path.is_file():
-        shipped = PublishedTables.find(path.parent).load(cell.disturbance, cell.severity, split, SEED)
+        shipped = PublishedTables.find(path.parent).load(cell.label, cell.severity, split, SEED)
         if len(shipped) >= episodes:
             return shipped.take(np.arange(episodes))
     return record(learner, task, cell, split, episodes)

@@ -11,7 +11,7 @@ import pandas as pd
 
 from safeswitch import registry, suite
 from safeswitch.handover.panel import Calibration
-from safeswitch.handover.published import AGAIN, PublishedTables, armings_of
+from safeswitch.handover.published import AGAIN, PublishedTables, armings_of, undisturbed
 from safeswitch.protocols import Arming, Calibrated
 from safeswitch.scoring.leaderboard import leaderboard
 from safeswitch.scoring.metrics import REFERENCES, TaskInfo
@@ -75,17 +75,17 @@ def score_method(tables: PublishedTables, name: str) -> Scored:
 def _calibrator(name: str) -> Calibrator:
     """Calibration as in the benchmark: on the cell itself, or on the one that its thresholds come from."""
 
-    def calibrate(tables: PublishedTables, name_: str, severity: int, learner: int, arming: Arming) -> Calibrated:
+    def calibrate(tables: PublishedTables, label: str, severity: int, learner: int, arming: Arming) -> Calibrated:
         task = suite.task(tables.task)
-        cell = next(each for each in task.cells if (each.disturbance, each.severity) == (name_, severity))
+        cell = next(each for each in task.cells if (each.label, each.severity) == (label, severity))
         on = task.calibrated_on(cell)
-        if not tables.has(on.disturbance, on.severity, "calibrate", learner):
+        if not tables.has(on.label, on.severity, "calibrate", learner):
             raise ValueError(
                 f"{tables.folder} has no calibrate episodes of {on} (learner {learner}): {name} cannot be calibrated: "
                 f"{AGAIN}, or give a ready rule with --rule"
             )
-        panel = tables.panel(on.disturbance, on.severity, "calibrate", learner, arming)
-        nominal = tables.load("none", 0, "calibrate", learner)
+        panel = tables.panel(on.label, on.severity, "calibrate", learner, arming)
+        nominal = tables.load(undisturbed(on.label), 0, "calibrate", learner)
         return registry.make_method(name).calibrate(Calibration(panel, nominal, seed=learner))
 
     return calibrate

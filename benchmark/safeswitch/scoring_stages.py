@@ -65,7 +65,7 @@ def _score_episodes(
         calibration = calibration_of(loaded, task, cell, protocol, trained.seed)
         for method_id in methods(task.signals):
             method: Method = registry.make_method(method_id)
-            if not method.latched and not give_back:
+            if not method.latched and not (give_back and protocol == "start"):
                 continue
             calibrated = method.calibrate(calibration)
             if calibrated.rule is None:
@@ -102,7 +102,7 @@ def _left_out_rows(
 
 def protocols_of(cell: Cell) -> tuple[Arming, ...]:
     """Armings under which a cell is scored."""
-    return armings_of(cell.disturbance)
+    return armings_of(cell.label)
 
 
 def test_panel(loaded: dict[str, HandoverTable], cell: Cell, protocol: Arming) -> Panel:
@@ -123,8 +123,8 @@ def _plain_rows(
     task: Task, cell: Cell, trained: Trained, test: Panel, method: Method, rule: Any
 ) -> pd.DataFrame:
     """Rules that give control back have no table: drive the same episodes."""
-    driver, signals = trained.learner(task), trained.signals(task)
-    envs = {True: make_env(task, cell), False: make_env(task, task.none_cell)}
+    driver, signals = trained.learner(task), trained.signals(task, getattr(rule, "reads", None))
+    envs = {True: make_env(task, cell), False: make_env(task, task.undisturbed(cell))}
     experts = {kind: env.make_expert() for kind, env in envs.items()}
     advisers = {kind: env.make_expert() if "expert-queries" in method.needs else None for kind, env in envs.items()}
     episodes = [
@@ -142,7 +142,7 @@ def labelled(
     """Rows of `scoring.rows` with the columns that say what they are rows of."""
     return rows.assign(
         task=cell.task,
-        disturbance=cell.disturbance,
+        disturbance=cell.label,
         severity=cell.severity,
         protocol=protocol,
         method=method_id,
@@ -202,6 +202,6 @@ def _score_signals(
             by_signal[signal] = replace(frames, episode_auroc=before.episode_auroc)
     rows = [{"signal": signal, **asdict(quality)} for signal, quality in by_signal.items()]
     frame = pd.DataFrame(rows).assign(
-        task=cell.task, disturbance=cell.disturbance, severity=cell.severity, learner=trained.seed
+        task=cell.task, disturbance=cell.label, severity=cell.severity, learner=trained.seed
     )
     save_frame(folder / "signals.npz", frame)

@@ -237,7 +237,12 @@ class CellTables:
     def load(self, store: Store, task: Task, cell: Cell) -> dict[str, HandoverTable]:
         """Each table by the name of its attribute; tables of the same episodes are one object."""
         on = task.calibrated_on(cell)
-        cells = {"calibrate": on, "calibrate_nominal": task.none_cell, "test": cell, "test_nominal": task.none_cell}
+        cells = {
+            "calibrate": on,
+            "calibrate_nominal": task.undisturbed(on),
+            "test": cell,
+            "test_nominal": task.undisturbed(cell),
+        }
         by_keys: dict[tuple[str, ...], HandoverTable] = {}
         for name, its_cell in cells.items():
             keys = getattr(self, name)

@@ -206,6 +206,7 @@ class VectorDwell(Dwell):
 
     def __init__(self, score: Score, lower: float):
         self.score = score
+        self.reads = score.baseline.names
         super().__init__(score.parameters.theta, lower)
 
     def arm(self, step: int) -> Driver:

@@ -26,6 +26,13 @@ from safeswitch_baselines.signals.discrepancy import TAU
 class Gate:
     """Gives control back: the expert drives from the step after `enters` until the step after `leaves`."""
 
+    signal: str
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """Ids of the signals that it looks at; no other one need be computed."""
+        return (self.signal,)
+
     def reset(self, seed: int) -> None:
         """Give the learner control."""
         self._driver = Driver.LEARNER
@@ -169,6 +176,11 @@ class ThriftyGate(Gate):
         self.signal, self.critic = signal, critic
         self.novelty, self.risk, self.ordinary, self.close = novelty, risk, ordinary, close
         self.reset(0)
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """The signal, and those of the critic."""
+        return (self.signal, *self.critic.names)
 
     def enters(self, step: int, signals: Mapping[str, float]) -> bool:
         """Novel or risky."""

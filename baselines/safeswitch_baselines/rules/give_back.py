@@ -58,6 +58,7 @@ class DwellOnSignal(Dwell):
     def __init__(self, signal: str, upper: float, lower: float):
         super().__init__(upper, lower)
         self.signal = signal
+        self.reads = (signal,)
 
     def value(self, step: int, signals: Mapping[str, float]) -> float:
         """The signal."""

@@ -41,7 +41,7 @@ class PublishedTables:
 
     Attributes:
         folder: where they are; its name is the task's.
-        files: (disturbance, severity, split, learner seed) -> file.
+        files: (disturbance, severity, split, learner seed) -> file; disturbances as in tables (`Cell.label`).
     """
 
     folder: Path
@@ -107,7 +107,8 @@ class PublishedTables:
     def panel(self, disturbance: str, severity: int, split: Split, learner: int, arming: Arming) -> Panel:
         """Episodes of a cell under an arming; under `start` with their undisturbed twins."""
         table = self.load(disturbance, severity, split, learner)
-        nominal = self.load("none", 0, split, learner) if arming == "start" and disturbance != "none" else None
+        twins = undisturbed(disturbance)
+        nominal = self.load(twins, 0, split, learner) if arming == "start" and disturbance != twins else None
         return panel_of(table, nominal, arming)
 
     def complete_panel(self, disturbance: str, severity: int, split: Split, learner: int, arming: Arming) -> Panel:
@@ -133,7 +134,13 @@ def panel_of(table: HandoverTable, nominal: HandoverTable | None, arming: Arming
 
 def armings_of(disturbance: str) -> tuple[Arming, ...]:
     """Armings under which a cell is scored: without a disturbance there is no onset."""
-    return ("start",) if disturbance == "none" else ARMINGS
+    return ("start",) if disturbance == undisturbed(disturbance) else ARMINGS
+
+
+def undisturbed(disturbance: str) -> str:
+    """Label of the undisturbed cell beside a cell's: "none", on the same track."""
+    _, at, track = disturbance.partition("@")
+    return "none" + at + track
 
 
 def write_table(table: HandoverTable, folder: Path, cell: Cell, split: Split, learner: int) -> Path:
@@ -141,6 +148,6 @@ def write_table(table: HandoverTable, folder: Path, cell: Cell, split: Split, le
     if (np.asarray(table.known()) == UNKNOWN).any():
         raise ValueError(f"the table of {cell}, {split}, learner {learner}, has unknown outcomes: complete it first")
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / file_name(cell.disturbance, cell.severity, split, learner)
+    path = folder / file_name(cell.label, cell.severity, split, learner)
     table.save(path, snapshots=False)
     return path

@@ -96,19 +96,19 @@ def _panel(
         raise unknown("split", split, SPLITS)
     if arming not in get_args(Arming):
         raise unknown("arming", arming, get_args(Arming))
-    if arming not in armings_of(cell.disturbance):
+    if arming not in armings_of(cell.label):
         raise ValueError(f"cell {cell} has no onset: use arming='start'")
     if split == "calibrate" and cell.tag == "held-out":
         raise ValueError(f"cell {cell} is held out: train on {task.paper_cell} and score it here with split='test'")
     if tables is not None:
-        return PublishedTables.find(tables).complete_panel(cell.disturbance, cell.severity, split, learner, arming)
+        return PublishedTables.find(tables).complete_panel(cell.label, cell.severity, split, learner, arming)
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}")
     from safeswitch.reference import reference_table
 
     table = reference_table(task, cell, split, episodes)
     beside = arming == "start" and cell.tag != "none"
-    nominal = reference_table(task, task.none_cell, split, episodes) if beside else None
+    nominal = reference_table(task, task.undisturbed(cell), split, episodes) if beside else None
     return panel_of(table, nominal, arming)
 
 
@@ -118,6 +118,6 @@ def find_cell(task: Task, disturbance: str | None, severity: int) -> Cell:
         disturbance = task.paper_cell.disturbance
     cells = (*task.cells, *task.severities(1, 2, 3, 4, 5))
     for cell in cells:
-        if cell.disturbance == disturbance and cell.severity in (severity, 0):
+        if cell.label == disturbance and cell.severity in (severity, 0):
             return cell
     raise unknown("cell", f"{task.name}/{disturbance}-{severity}", map(str, cells))
