@@ -47,7 +47,8 @@ def test_names_are_unique() -> None:
 def test_every_cell_is_of_its_task(cell: Cell) -> None:
     task = suite.task(cell.task)
     if cell.tag == "none":
-        assert (cell.disturbance, cell.severity, cell.env_kwargs) == ("none", 0, {})
+        track = {"track": cell.track} if cell.track else {}
+        assert (cell.disturbance, cell.severity, cell.env_kwargs) == ("none", 0, track)
     else:
         assert cell.disturbance in offered(task.name) and cell.severity in SEVERITIES
         assert cell.env_kwargs == {"disturbance": cell.disturbance, "severity": cell.severity}

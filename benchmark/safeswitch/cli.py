@@ -1,4 +1,4 @@
-"""The command line: bench, demos, train, evaluate, gate, expert-report, list, play, doctor."""
+"""When should a learned controller hand control back to an expert? Run, score and compare switch rules."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import tyro
 from rich.markup import escape
 from rich.table import Table
 
-from safeswitch import registry, suite
+from safeswitch import commands, registry, suite
 from safeswitch.console import console
 
 
@@ -244,6 +244,9 @@ Command = (
     | Annotated[Demos, tyro.conf.subcommand("demos")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[commands.Score, tyro.conf.subcommand("score")]
+    | Annotated[commands.Compare, tyro.conf.subcommand("compare")]
+    | Annotated[commands.Reference, tyro.conf.subcommand("reference")]
     | Annotated[Gate, tyro.conf.subcommand("gate")]
     | Annotated[ExpertReport, tyro.conf.subcommand("expert-report")]
     | Annotated[List, tyro.conf.subcommand("list")]

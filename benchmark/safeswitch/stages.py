@@ -198,6 +198,18 @@ def load_table(store: Store, task: Task, cell: Cell, keys: tuple[str, ...]) -> H
     return recorded_table(store, keys).attach(env, env.make_expert())
 
 
+def complete_job(store: Store, task: Task, cell: Cell, recorded: tuple[str, ...]) -> Job:
+    """Chunks of a recorded table as one, with every outcome computed and without snapshots."""
+    code = [*PHYSICS, *task.code(), *HANDOVER]
+    key = store.key("complete-table", {"env": task.env_id, "cell": cell.env_kwargs}, recorded, code)
+    return Job("complete-table", str(cell), key, _complete, (str(store.root), task, cell, recorded))
+
+
+def _complete(folder: Path, root: str, task: Task, cell: Cell, recorded: tuple[str, ...]) -> None:
+    table = load_table(Store(Path(root)), task, cell, recorded)
+    table.complete().save(folder / "table.npz", snapshots=False)
+
+
 @dataclass(frozen=True)
 class CellTables:
     """Keys of the table chunks that one (learner, cell) is calibrated and tested on.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
@@ -315,6 +316,7 @@ TASKS: dict[str, Task] = {
             "safeswitch.tasks.rally_car_config",
             "safeswitch.tasks.rally_car_image",
             "safeswitch.tasks.rally_disturbances",
+            "safeswitch.tasks.rally_visual",
             "safeswitch.tasks.rendering",
             "safeswitch.tasks.sight",
             "safeswitch.tasks.track",
@@ -347,6 +349,8 @@ CONTROLS = ("random", "periodic", "shuffled@total", *(f"random-{share}" for shar
 QUANTILES = ("fixed-q95", "fixed-q99", "fixed-q999", "fixed-epmax95")
 VALUES = ("fixed-0.05@total", "fixed-0.1@total", "fixed-0.2@total", "fixed-0.4@total")
 CEM_VARIANTS = ("cem-literal@total", "cem-single@total", "cem-high@total", "cem-low@total")
+OPTIONAL: Mapping[str, tuple[str, str]] = {"ppo@signals": ("stable_baselines3", "rl")}
+"""Methods that need a library which is not installed by default: the module, and the extra that brings it."""
 MONITORS = ("conformal", "conformal-band", "patience")
 MATCHED = tuple(f"share-{share}" for share in SHARES)
 PER_SIGNAL = ("cem", "grid", "random-search", *QUANTILES, *MONITORS, *MATCHED, "best")
@@ -357,11 +361,21 @@ DOUBTS = ("ensemble", "epistemic")
 
 
 def methods(signals: tuple[str, ...]) -> tuple[str, ...]:
-    """Every method of the comparison on these signals."""
+    """Every method of the comparison on these signals; optional ones where their library is installed."""
     doubts = tuple(signal for signal in DOUBTS if signal in signals)[:1]
     give_back = [method for method in GIVE_BACK if method.partition("@")[2] in signals]
     give_back += _methods(doubts, ("ensemble-dagger", "thrifty"))
-    return (*BOUNDS, *CONTROLS, *VALUES, *CEM_VARIANTS, *OURS, *_methods(signals, PER_SIGNAL), *give_back)
+    optional = [method for method in OPTIONAL if method not in without_extra()]
+    return (*BOUNDS, *CONTROLS, *VALUES, *CEM_VARIANTS, *OURS, *_methods(signals, PER_SIGNAL), *give_back, *optional)
+
+
+def without_extra() -> dict[str, str]:
+    """Optional methods whose library is not installed, each with its remedy."""
+    return {
+        name: f"{name} is left out: it needs {module.replace('_', '-')}, pip install 'safeswitch[{extra}]'"
+        for name, (module, extra) in OPTIONAL.items()
+        if find_spec(module) is None
+    }
 
 
 @dataclass(frozen=True)
