@@ -95,8 +95,8 @@ class Task:
         literal_options: overrides of its configuration.
         others: most learners of other seeds that an ensemble asks beside its own; None for all of them.
         costly: whether an outcome takes so long that a run must do without some: cells after the first three then have
-            half the episodes, signals are scored at the severities of the cells alone, and no cell has rows that leave its
-            disturbance out or rules that give control back.
+            half the episodes, signals are scored at the severities of the cells alone, and no cell has rows that leave
+            its disturbance out or rules that give control back.
     """
 
     name: str
