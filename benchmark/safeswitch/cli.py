@@ -1,4 +1,4 @@
-"""The command line: bench, demos, train, evaluate, gate, expert-report, list, play, doctor.
+"""When should a learned controller hand control back to an expert? Run, score and compare switch rules.
 
 Exit codes: 0 done; 1 a check failed, or a stage stopped with an error; 2 bad input; 130 interrupted (Ctrl-C).
 """
@@ -16,7 +16,7 @@ import tyro
 from rich.markup import escape
 from rich.table import Table
 
-from safeswitch import registry, suite
+from safeswitch import commands, registry, suite
 from safeswitch.console import StageError, answer, console, log, set_output
 from safeswitch.interrupts import for_this_process_alone
 
@@ -302,6 +302,9 @@ Command = (
     | Annotated[Demos, tyro.conf.subcommand("demos")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[commands.Score, tyro.conf.subcommand("score")]
+    | Annotated[commands.Compare, tyro.conf.subcommand("compare")]
+    | Annotated[commands.Reference, tyro.conf.subcommand("reference")]
     | Annotated[Gate, tyro.conf.subcommand("gate")]
     | Annotated[ExpertReport, tyro.conf.subcommand("expert-report")]
     | Annotated[List, tyro.conf.subcommand("list")]

@@ -157,10 +157,9 @@ class Run:
         for group in (none, tuple(cell for cell in cells if cell not in none)):  # the others share outcomes of `none`
             stage = []
             for trained, cell in product(self.trained, group):
-                counts: dict[Split, int] = {"test": self.profile.test}
-                if cell in calibrated_on:
-                    counts["calibrate"] = self.profile.calibrate
-                for split, count in counts.items():
+                splits: tuple[Split, ...] = ("test", "calibrate") if cell in calibrated_on else ("test",)
+                for split in splits:
+                    count = self.profile.episodes(task, cell, split)
                     twins = chunks.get((trained.seed, task.undisturbed(cell), split), ())
                     jobs = table_jobs(self.store, task, cell, split, count, trained, twins)
                     chunks[trained.seed, cell, split] = jobs
@@ -173,7 +172,7 @@ class Run:
                 keys[seed, task.undisturbed(task.calibrated_on(cell)), "calibrate"],
                 keys[seed, cell, "test"],
                 keys[seed, task.undisturbed(cell), "test"],
-                tuple((other, keys[seed, other, "calibrate"]) for other in others(cell, cells)),
+                tuple((other, keys[seed, other, "calibrate"]) for other in others(cell, cells) if not task.costly),
             )
             for seed in range(len(self.learners))
             for cell in cells
@@ -209,7 +208,7 @@ class Run:
                 cell,
                 self.trained[seed],
                 keys,
-                tables[seed, str(self.task.undisturbed(cell))].test[: None if cell in self.profile.cells_of(self.task) else chunks],
+                tables[seed, str(self.task.undisturbed(cell))].test[: len(keys) or chunks],
             )
             for (seed, cell), keys in {**test, **further}.items()
         ]
@@ -226,6 +225,7 @@ class Run:
             else table_jobs(self.store, self.task, cell, "test", count, trained)
             for trained in self.trained
             for cell in self.task.severities(*profile.signal_severities)
+            if not self.task.costly
         }
         if chunks:
             self.finish("further severities", [job for jobs in chunks.values() for job in jobs])
@@ -274,7 +274,7 @@ class Run:
         return run
 
     def _gives_back(self, cell: object) -> bool:
-        return cell in self.task.cells[: self.profile.give_back_cells]
+        return cell in self.task.cells[: self.profile.give_back_cells] and not self.task.costly
 
     @property
     def stages(self) -> tuple[str, ...]:

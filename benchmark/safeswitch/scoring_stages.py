@@ -16,15 +16,17 @@ from safeswitch import registry
 from safeswitch.files import save_arrays, save_frame
 from safeswitch.handover.episode import run_episode
 from safeswitch.handover.panel import Calibration, Panel
+from safeswitch.handover.published import armings_of, panel_of
 from safeswitch.handover.shown import shown_traces
-from safeswitch.handover.table import HandoverTable, concatenate
-from safeswitch.protocols import ARMINGS, Arming
+from safeswitch.handover.table import HandoverTable
+from safeswitch.protocols import Arming
 from safeswitch.scoring.metrics import OTHERS
 from safeswitch.scoring.rows import episode_rows, latched_rows
+from safeswitch.scoring.sightings import sightings
 from safeswitch.scoring.signal_quality import SignalQuality, frame_quality, signal_quality
-from safeswitch.stages import CellTables, Job, concat, load_table, make_env, only_seen, recorded_table, source_of
-from safeswitch.store import Store
-from safeswitch.suite import Cell, Task, methods
+from safeswitch.stages import CellTables, Job, can_be_shown, concat, load_table, make_env, recorded_table, source_of
+from safeswitch.store import LIBRARIES, Store
+from safeswitch.suite import OPTIONAL, Cell, Task, methods
 from safeswitch.trained import Trained
 
 if TYPE_CHECKING:
@@ -40,7 +42,8 @@ def episodes_job(store: Store, task: Task, cell: Cell, trained: Trained, tables:
     settings = {"cell": str(cell), "learner_seed": trained.seed, "methods": list(ids), "give_back": give_back}
     rules = {source_of("method", name.partition("@")[0]) for name in ids}
     code = ["safeswitch.handover.panel", "safeswitch.scoring.rows", *sorted(rules)]
-    key = store.key("episodes", settings, [*trained.keys, *tables.keys], code)
+    optional = [module.replace("_", "-") for name, (module, _) in OPTIONAL.items() if name in ids]
+    key = store.key("episodes", settings, [*trained.keys, *tables.keys], code, [*LIBRARIES, *optional])
     arguments = (str(store.root), task, cell, trained, tables, give_back)
     return Job("episodes", f"{cell} learner {trained.seed}", key, _score_episodes, arguments)
 
@@ -77,7 +80,7 @@ def _score_episodes(
         if others is not None:
             nominal = loaded["calibrate_nominal"]
             twins = nominal.take(np.tile(np.arange(len(nominal)), len(others) // len(nominal)))
-            left_out = Calibration(_panel(others, twins, cell, protocol), nominal, seed=trained.seed)
+            left_out = Calibration(panel_of(others, twins, protocol), nominal, seed=trained.seed)
             frames += _left_out_rows(task, cell, trained, test, left_out)
     save_frame(folder / "episodes.npz", concat(frames))
     save_arrays(folder / "logs.npz", **logs)
@@ -99,28 +102,22 @@ def _left_out_rows(
 
 
 def protocols_of(cell: Cell) -> tuple[Arming, ...]:
-    """Armings under which a cell is scored: without a disturbance there is no onset."""
-    return ("start",) if cell.tag == "none" else ARMINGS
+    """Armings under which a cell is scored."""
+    return armings_of(cell.label)
 
 
 def test_panel(loaded: dict[str, HandoverTable], cell: Cell, protocol: Arming) -> Panel:
     """Test episodes of a cell under an arming."""
-    return _panel(loaded["test"], loaded["test_nominal"], cell, protocol)
+    nominal = None if cell.tag == "none" else loaded["test_nominal"]
+    return panel_of(loaded["test"], nominal, protocol)
 
 
 def calibration_of(
     loaded: dict[str, HandoverTable], task: Task, cell: Cell, protocol: Arming, seed: int
 ) -> Calibration:
     """Calibrate episodes of a cell under an arming."""
-    panel = _panel(loaded["calibrate"], loaded["calibrate_nominal"], task.calibrated_on(cell), protocol)
-    return Calibration(panel, loaded["calibrate_nominal"], seed=seed)
-
-
-def _panel(table: HandoverTable, nominal: HandoverTable, cell: Cell, protocol: Arming) -> Panel:
-    """Disturbed episodes, and under `start` their undisturbed twins beside them."""
-    if cell.tag == "none":
-        return Panel(nominal, protocol)
-    return Panel(concatenate([table, nominal]) if protocol == "start" else table, protocol)
+    nominal = loaded["calibrate_nominal"]
+    return Calibration(panel_of(loaded["calibrate"], nominal, protocol), nominal, seed=seed)
 
 
 def _plain_rows(
@@ -163,8 +160,8 @@ def signals_job(
 ) -> Job:
     """Signal quality of one (learner, cell), from tables of test episodes (or none) and of their undisturbed twins.
 
-    A disturbance that is only seen is judged on the twins' states, with and without it in view; then no disturbed
-    episode is needed for the frames.
+    A disturbance that is only seen, or placed, is judged on the twins' states, with and without it in view; then no
+    disturbed episode is needed for the frames.
     """
     settings = {
         "cell": str(cell),
@@ -172,7 +169,8 @@ def signals_job(
         "signals": list(task.signals),
         "shown_chunks": SHOWN_CHUNKS,
     }
-    code = ["safeswitch.scoring.signal_quality", "safeswitch.handover.table", "safeswitch.handover.shown"]
+    scoring = ["safeswitch.scoring.signal_quality", "safeswitch.scoring.sightings"]
+    code = [*scoring, "safeswitch.handover.table", "safeswitch.handover.shown"]
     key = store.key("signals", settings, [*trained.keys, *disturbed, *twins], code)
     arguments = (str(store.root), task, cell, trained, disturbed, twins)
     return Job("signals", f"{cell} learner {trained.seed}", key, _score_signals, arguments)
@@ -195,17 +193,18 @@ def _score_signals(
         about = (disturbed.onset, disturbed.t_first, disturbed.learner_success)
         for signal in task.signals:
             by_signal[signal] = signal_quality(disturbed.signals[signal], twins.signals[signal], *about)
-    if only_seen(cell):
+    about_cell = {"task": cell.task, "disturbance": cell.label, "severity": cell.severity, "learner": trained.seed}
+    if can_be_shown(cell):
         env = make_env(task, cell)
         states = recorded_table(store, twin_keys[:SHOWN_CHUNKS])
-        shown, visible = shown_traces(env, trained.learner(task), trained.signals(task), states)
+        shown = shown_traces(env, trained.learner(task), trained.signals(task), states)
         env.close()
+        if np.isfinite(shown.distance).any():
+            seen = sightings(shown, dict(states.signals), task.signals).assign(**about_cell)
+            save_frame(folder / "sightings.npz", seen)
         for signal in task.signals:
-            frames = frame_quality(shown[signal], states.signals[signal], visible)
+            frames = frame_quality(shown.traces[signal], states.signals[signal], shown.judged)
             before = by_signal.get(signal, frames)
             by_signal[signal] = replace(frames, episode_auroc=before.episode_auroc)
     rows = [{"signal": signal, **asdict(quality)} for signal, quality in by_signal.items()]
-    frame = pd.DataFrame(rows).assign(
-        task=cell.task, disturbance=cell.label, severity=cell.severity, learner=trained.seed
-    )
-    save_frame(folder / "signals.npz", frame)
+    save_frame(folder / "signals.npz", pd.DataFrame(rows).assign(**about_cell))

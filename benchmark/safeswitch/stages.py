@@ -157,7 +157,7 @@ def table_jobs(
             "split": split,
             "seeds": episode_seeds(split, size, first),
             "signals": list(task.signals),
-            "complete": cell.complete(split),
+            "complete": cell.complete(split, task.costly),
         }
         key = store.key("table", settings, [*trained.keys, *twin], code)
         label = f"{cell} {split} {first}-{first + size - 1} (learner {trained.seed})"
@@ -181,7 +181,7 @@ def _tabulate(
     table = record_table(env, trained.learner(task), trained.signals(task), env.make_expert(), seeds)
     for twin in twins:
         table.share(HandoverTable.load(Path(twin) / "table.npz"))
-    if cell.complete(split):
+    if cell.complete(split, task.costly):
         table.complete()
     table.save(folder / "table.npz")
     env.close()
@@ -196,6 +196,18 @@ def load_table(store: Store, task: Task, cell: Cell, keys: tuple[str, ...]) -> H
     """The same with a simulator that resolves the outcomes still unknown."""
     env = make_env(task, cell)
     return recorded_table(store, keys).attach(env, env.make_expert())
+
+
+def complete_job(store: Store, task: Task, cell: Cell, recorded: tuple[str, ...]) -> Job:
+    """Chunks of a recorded table as one, with every outcome computed and without snapshots."""
+    code = [*PHYSICS, *task.code(), *HANDOVER]
+    key = store.key("complete-table", {"env": task.env_id, "cell": cell.env_kwargs}, recorded, code)
+    return Job("complete-table", str(cell), key, _complete, (str(store.root), task, cell, recorded))
+
+
+def _complete(folder: Path, root: str, task: Task, cell: Cell, recorded: tuple[str, ...]) -> None:
+    table = load_table(Store(Path(root)), task, cell, recorded)
+    table.complete().save(folder / "table.npz", snapshots=False)
 
 
 @dataclass(frozen=True)
@@ -247,11 +259,19 @@ def only_seen(cell: Cell) -> bool:
     return cell.tag != "none" and DISTURBANCES[cell.disturbance].only_seen
 
 
+def can_be_shown(cell: Cell) -> bool:
+    """Whether undisturbed states can be seen with the disturbance: nothing else changes, or it stands ahead of them."""
+    from safeswitch.tasks.disturbances import DISTURBANCES  # imports mujoco
+
+    return cell.tag != "none" and (only_seen(cell) or DISTURBANCES[cell.disturbance].placed)
+
+
 def concat(frames: list[pd.DataFrame]) -> pd.DataFrame:
     """Frames below one another."""
     return pd.concat(frames, ignore_index=True)
 
 
 def load_rows(store: Store, jobs: list[Job], name: str) -> pd.DataFrame:
-    """The data frames that jobs wrote as `name`, put together."""
-    return concat([load_frame(store.folder(job.key) / name) for job in jobs])
+    """The data frames that jobs wrote as `name`, put together; an empty one if none of them did."""
+    files = [path for job in jobs if (path := store.folder(job.key) / name).exists()]
+    return concat([load_frame(path) for path in files]) if files else pd.DataFrame()
