@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from rich.console import RenderableType
 from rich.markup import escape
 from rich.table import Table
 
@@ -171,7 +172,8 @@ class Gate:
         """Do it; 1 if a task is below the gate."""
         from safeswitch.evaluate import GATE, gate
 
-        rows, shown, passed = {}, [], True
+        rows, passed = {}, True
+        shown: list[RenderableType] = []
         for run in self.common.runs():
             rows[run.task.name] = gate(run, self.episodes, self.every)
             table = Table("check", "trials", "success", "95 % interval", title=run.task.name)

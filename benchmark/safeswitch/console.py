@@ -12,7 +12,7 @@ import os
 import sys
 import time
 from types import TracebackType
-from typing import Any
+from typing import Any, Literal
 
 from rich.console import Console, RenderableType
 from rich.progress import MofNCompleteColumn, ProgressColumn, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -23,7 +23,7 @@ from rich.text import Text
 
 from safeswitch.files import jsonable
 
-COLOURS = None if os.environ.get("NO_COLOR") else "auto"
+COLOURS: Literal["auto"] | None = None if os.environ.get("NO_COLOR") else "auto"
 
 console = Console(highlight=False, soft_wrap=True, color_system=COLOURS)
 """Answers: tables, paths, JSON."""
