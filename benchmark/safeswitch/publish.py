@@ -17,12 +17,15 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from safeswitch import pictures, registry
-from safeswitch.files import load_json, save_frame, save_json
+from safeswitch.files import load_frame, load_json, save_frame, save_json
+from safeswitch.report.views import table_name, tables_in
 from safeswitch.scoring.comparisons import paired_comparisons
 from safeswitch.scoring.leaderboard import leaderboard, merge_task_rows, read_csv, write_csv
 from safeswitch.scoring.markdown import write_markdown
 from safeswitch.scoring.metrics import TaskInfo
 from safeswitch.scoring.signal_quality import signal_table
+from safeswitch.scoring.thresholds import FILE as THRESHOLDS
+from safeswitch.scoring.thresholds import plain_thresholds, write_thresholds
 from safeswitch.scoring_stages import calibration_of, protocols_of
 from safeswitch.stages import Job, load_rows, source_of
 from safeswitch.store import Store
@@ -56,8 +59,7 @@ def publish(run: Run, folder: Path | None = None) -> Path:
             table = read_csv(run.store.folder(run.literal.scores.key) / f"{name}.csv")
             _merge(folder / f"paper_literal_{name}.csv", table)
     _replace(run.store.folder(figures.key) / "figures", folder / "figures" / run.task.name)
-    if run.profile.tables:
-        _write_tables(run, folder / "tables" / run.task.name)
+    _write_tables(run, folder / "tables" / run.task.name)
     manifest = _manifest(run, folder, commit, time.time() - started)
     save_json(folder / "manifest.json", manifest)
     write_markdown(
@@ -136,13 +138,25 @@ def figures_job(store: Store, task: Task, trained: Trained, episodes: Job, table
 
 
 def _write_tables(run: Run, folder: Path) -> None:
-    """Tables of the first three cells: signals and known outcomes, to score latched rules without MuJoCo."""
-    folder.mkdir(parents=True, exist_ok=True)
+    """Tables of the first three cells: signals and known outcomes, to score latched rules without MuJoCo.
+
+    Beside them, to the last bit, the thresholds of those methods that are a constant threshold.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    rows = {}
     for job in run.episodes:
         cell, trained = job.arguments[2], job.arguments[3]
         if cell in run.task.cells[:3]:
-            target = folder / f"{cell.disturbance}-{cell.severity}-learner{trained.seed}.npz"
-            shutil.copyfile(run.store.folder(job.key) / "test.npz", target)
+            source = run.store.folder(job.key)
+            shutil.copyfile(source / "test.npz", folder / table_name(cell, trained.seed))
+            rows[cell, trained.seed] = load_frame(source / "episodes.npz")
+    plain = []
+    for view in tables_in(folder, run.task).views():
+        for learner, panel in view.panels.items():
+            frame = rows[view.cell, learner]
+            plain.append(plain_thresholds(panel, frame[frame["protocol"] == view.protocol]))
+    write_thresholds(pd.concat(plain, ignore_index=True), folder / THRESHOLDS)
 
 
 def _merge(target: Path, rows: pd.DataFrame) -> None:

@@ -246,7 +246,6 @@ class Profile:
         give_back_cells: cells, from the front, in which rules that give control back are run as plain episodes.
         demonstrations: overrides of the task's demonstrations.
         learner_options: overrides of the learner's configuration.
-        tables: whether the tables of the first three cells are committed with the results.
         signal_severities: further severities of every disturbance at which the signals, and nothing else, are scored.
         signal_episodes: test episodes of those.
         literal_learners: number of learner seeds of the paper's learner taken literally.
@@ -260,7 +259,6 @@ class Profile:
     give_back_cells: int = 0
     demonstrations: Mapping[str, Any] = field(default_factory=dict)
     learner_options: Mapping[str, Any] = field(default_factory=dict)
-    tables: bool = False
     signal_severities: tuple[int, ...] = ()
     signal_episodes: int = 20
     literal_learners: int = 0
@@ -288,7 +286,6 @@ PROFILES: dict[str, Profile] = {
         calibrate=40,
         test=40,
         give_back_cells=3,
-        tables=True,
         signal_severities=(1, 5),
         literal_learners=2,
     ),

@@ -13,10 +13,10 @@ from safeswitch import registry
 from safeswitch.files import load_json
 from safeswitch.handover.panel import Panel
 from safeswitch.handover.table import HandoverTable
+from safeswitch.pictures import STORY
 from safeswitch.report.marks import Mark, marks
 from safeswitch.report.pack import Order, Pack, levels, records
-from safeswitch.report.views import TaskTables, View, load_tables, name_of
-from safeswitch.scoring.metrics import CELL
+from safeswitch.report.views import TaskTables, name_of, tables_in
 from safeswitch.stages import make_env
 from safeswitch.suite import Cell, Task
 from safeswitch.tasks.disturbances import DISTURBANCES
@@ -26,9 +26,6 @@ NUMBERS = (
     "skill_hi", "recovery", "harm", "timely", "margin_s", "delay_s", "false_alarms", "threshold", "tuning_episodes",
 )  # fmt: skip
 """Columns of the leaderboard that the page shows."""
-
-STORY = "story.json"
-"""Beside the films of one episode under several drivers: when what happened, and the signal's trace of each."""
 
 
 def task_bundle(folder: Path, task: Task, rows: pd.DataFrame, manifest: dict[str, Any]) -> tuple[dict[str, Any], Pack]:
@@ -45,8 +42,8 @@ def task_bundle(folder: Path, task: Task, rows: pd.DataFrame, manifest: dict[str
         "film": _film(folder, task),
     }
     env.close()
-    pack, tables = Pack(), load_tables(folder / "tables" / task.name, task)
-    if tables is not None:
+    pack, tables = Pack(), tables_in(folder / "tables" / task.name, task)
+    if tables.tables:
         bundle["exact"] = _exact(folder, tables, rows, pack)
         bundle["arrays"] = pack.directory
     return bundle, pack
@@ -118,8 +115,8 @@ def _exact(folder: Path, tables: TaskTables, rows: pd.DataFrame, pack: Pack) -> 
         marked[view.cell, view.protocol] = (view, marks(view, board[board["protocol"] == view.protocol], folder))
     stacked = {cell: tables.stacked(cell) for cell in tables.cells}
     for cell, table in stacked.items():
-        _add_table(pack, name_of(cell), table, tables)
-    signals = [_signal(name, stacked, marked, pack, len(tables.learners)) for name in tables.signals]
+        _add_table(pack, name_of(cell), table)
+    signals = [_signal(name, stacked, marked, pack) for name in tables.signals]
     return {
         "horizon": tables.horizon,
         "learners": tables.learners,
@@ -130,7 +127,7 @@ def _exact(folder: Path, tables: TaskTables, rows: pd.DataFrame, pack: Pack) -> 
     }
 
 
-def _add_table(pack: Pack, cell: str, table: HandoverTable, tables: TaskTables) -> None:
+def _add_table(pack: Pack, cell: str, table: HandoverTable) -> None:
     """Everything of a cell that does not depend on a signal; outcome 2 is unknown, `t*` is -1 where there is none."""
     pack.add(f"{cell}/seed", table.seeds, "int32")
     pack.add(f"{cell}/onset", table.onset, "int16")
@@ -143,7 +140,7 @@ def _add_table(pack: Pack, cell: str, table: HandoverTable, tables: TaskTables) 
         pack.add(f"{cell}/last", np.nan_to_num(table.t_last, nan=-1), "int16")
 
 
-def _signal(name: str, stacked: dict[Cell, HandoverTable], marked: Any, pack: Pack, learners: int) -> dict[str, Any]:
+def _signal(name: str, stacked: dict[Cell, HandoverTable], marked: Any, pack: Pack) -> dict[str, Any]:
     """One signal: its axis, traces, records under each arming, marks and margins."""
     runs = {}
     for cell, table in stacked.items():

@@ -89,8 +89,8 @@ def marks(view: View, rows: pd.DataFrame, folder: Path) -> list[Mark]:
     published = read_thresholds(path) if path.is_file() else None
     found = {(row["method"], row["calibrated_on"]): row for _, row in rows.iterrows()}
     chosen = []
-    for mark in [*_best(view, found), *(_written(view, found, published) if published is not None else
-                                        _recovered(view, found, folder))]:  # fmt: skip
+    chosen_by_rules = _recovered(view, found, folder) if published is None else _written(view, found, published)
+    for mark in [*_best(view, found), *chosen_by_rules]:
         wrong = _disagreement(view, mark, found[mark.method, mark.calibrated_on])
         if not wrong:
             chosen.append(mark)
@@ -152,7 +152,8 @@ def _of_cem(view: View, method: str, on: str, seeds: pd.DataFrame) -> list[float
         return None
     here = seeds[(seeds[CELL] == [paper.task, paper.disturbance, paper.severity, view.protocol]).all(axis=1)]
     own = here[(here["method"] == method) & (here["cem_seed"] == here["learner"])].set_index("learner")["threshold"]
-    return [float(own[learner]) for learner in view.tables.learners] if set(view.tables.learners) <= set(own.index) else None
+    there = set(view.tables.learners) <= set(own.index)
+    return [float(own[learner]) for learner in view.tables.learners] if there else None
 
 
 def _is_number(text: str) -> bool:

@@ -1,4 +1,4 @@
-"""What the page explores exactly: the test episodes of a cell under an arming, as `Panel`s from the published tables."""
+"""What the page explores exactly: test episodes of a cell under an arming, as `Panel`s of the published tables."""
 
 from __future__ import annotations
 
@@ -100,12 +100,17 @@ def name_of(cell: Cell) -> str:
     return f"{cell.disturbance}-{cell.severity}"
 
 
-def load_tables(folder: Path, task: Task) -> TaskTables | None:
-    """The tables in `folder`, None if there are none."""
+def table_name(cell: Cell, learner: int) -> str:
+    """Name of the file that holds the test episodes of a learner in a cell."""
+    return f"{name_of(cell)}{SEPARATOR}{learner}.npz"
+
+
+def tables_in(folder: Path, task: Task) -> TaskTables:
+    """The tables in a folder; an empty one has none."""
     tables = {}
     for path in sorted(folder.glob(f"*{SEPARATOR}*.npz")):
         cell, _, learner = path.stem.rpartition(SEPARATOR)
         if cell not in (known := [name_of(cell) for cell in task.cells]):
             raise unknown("cell", cell, known)
         tables[cell, int(learner)] = HandoverTable.load(path)
-    return TaskTables(task, tables) if tables else None
+    return TaskTables(task, tables)

@@ -13,9 +13,9 @@ const COLUMNS = [
   { key: "false_alarms", name: "False alarms", digits: 2, better: 1, title: "per undisturbed episode" },
   { key: "margin_s", name: "Margin [s]", digits: 2, better: -1, title: "from the handover to the end of the safe window" },
   { key: "threshold", name: "Threshold", digits: 0, better: -1, title: "median over learners" },
-  { key: "tuning_episodes", name: "Tuning episodes", digits: 0, better: 1 },
+  { key: "tuning_episodes", name: "Tuning", title: "episodes used to choose the threshold", digits: 0, better: 1 },
 ];
-const BAR = { width: 108, height: 20, edge: 3 };
+const BAR = { width: 76, height: 20, edge: 3 };
 
 function reference(board) {
   const rows = board.rows.filter((row) => /^(learner|expert|timer)$/.test(row.method));

@@ -1,6 +1,6 @@
 // The page's state, and what happens when something is chosen.
 
-const state = { method: "cem@total", signal: "total", learner: -1, sort: { key: "return_mean", down: true } };
+const state = { method: null, signal: "total", learner: -1, sort: { key: "return_mean", down: true } };
 const tasks = {};
 
 function cellTitle(cell) {
@@ -39,8 +39,20 @@ function chooseCell(name) {
       : "The rule is asked from the first step on, and nothing ever happens: every handover is a false alarm." };
   $("about").textContent = [state.cell.about && `${capital(state.cell.about)}.`.replace("..", "."), arming[state.protocol]].filter(Boolean).join(" ");
   state.board = state.cell.boards[state.protocol];
-  if (!state.board.rows.some((row) => row.method === state.method)) state.method = "cem@total";
+  if (!state.board.rows.some((row) => row.method === state.method)) startWith(bestCEM(state.board));
   chooseView();
+}
+
+// The page opens on the paper's rule, on the signal that suits it best here.
+function bestCEM(board) {
+  const rows = board.rows.filter((row) => row.method.startsWith("cem@"));
+  return rows.reduce((a, b) => (b.return_mean > a.return_mean ? b : a), rows[0] || board.rows[0]).method;
+}
+
+function startWith(method) {
+  state.method = method;
+  const signal = method.split("@")[1];
+  if (state.task.exact && state.task.exact.signals.some((each) => each.name === signal)) state.signal = $("signal").value = signal;
 }
 
 function capital(words) {

@@ -75,7 +75,7 @@ function drawPlayer(state) {
   drawTrace(state, episode);
   const slider = $("time");
   slider.max = episode.length;
-  setTime(state, episode.handover < episode.length ? episode.handover : episode.length);
+  setTime(state, 0);
   $("story").textContent = storyOf(episode, state.task.dt);
   $("player-how").textContent = episode.counterfactual
     ? "The trace is the learner’s alone. Blue: it drives; orange: the expert would drive instead. The strip below says, for each step, whether handing over there would succeed."

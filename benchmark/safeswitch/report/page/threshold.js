@@ -2,7 +2,7 @@
 
 const SWEEP = { shares: 210, returns: 96, gap: 30, left: 52, right: 20, top: 34, bottom: 46, points: 240 };
 const POSITIONS = 1000;
-const CURVES = [["success", "success"], ["autonomy", "autonomy"], ["false_alarms", "false alarms an undisturbed episode"]];
+const CURVES = [["success", "success"], ["autonomy", "autonomy"], ["false_alarms", "false alarms"]];
 
 function makeSweep(view) {
   const axis = axisOf(view);
@@ -66,10 +66,11 @@ function drawSweep(state) {
     const share = (event.clientX - root.getBoundingClientRect().left - x.from) / (x.to - x.from);
     setThreshold(Math.max(0, Math.min(1, share)));
   });
-  holder.replaceChildren(root, sweepLegend(view));
+  holder.replaceChildren(root);
+  $("sweep-legend").replaceChildren(sweepLegend(view));
   $("slider").parentElement.style.cssText = `margin-left:${SWEEP.left - 9}px;margin-right:${SWEEP.right - 9}px`;
   $("sweep-caption").textContent = `Scores of a constant threshold on ${view.signal} over ${view.size} episodes, ` +
-    `${cellTitle(state.cell)}, armed at ${state.protocol}. Diamonds: thresholds that a method chose` +
+    `${cellTitle(state.cell)}, armed at ${state.protocol}. Signs above: thresholds that methods chose` +
     `${view.learner < 0 && view.task.exact.learners.length > 1 ? ", in the middle of its learners’ own (small ticks)" : ""}.`;
   state.sweepNow = (value, scores) => {
     const px = Math.max(x.from, Math.min(x.to, x(value)));
@@ -116,10 +117,11 @@ function sweepLegend(view) {
 }
 
 function drawMarkButtons(state) {
+  const { view } = state;
   $("marks").replaceChildren(...state.marks.map((mark) => {
     const icon = svg("svg", { viewBox: "-8 -8 16 16", width: 14, height: 14, "aria-hidden": "true" }, glyph(mark.method));
     const button = html("button", { type: "button", "data-method": mark.method, "data-on": mark.on, "aria-pressed": "false" },
-      icon, mark.method.split("@")[0], html("span", { class: "at" }, text(mark.value)));
+      icon, mark.method.split("@")[0], html("span", { class: "hidden" }, `@${view.signal} at `), html("span", { class: "at" }, text(mark.value)));
     button.addEventListener("click", () => setMark(mark));
     return button;
   }));
@@ -228,12 +230,14 @@ function showFails(scores, view) {
 function drawMosaic(state) {
   const { view } = state;
   const box = $("mosaic");
-  const rows = view.task.exact.learners.map((learner) => {
-    const theirs = view.episodes.map((episode, index) => [episode, index]).filter(([episode]) => episode.learner === learner);
-    return theirs.length && html("div", {}, theirs.map(([episode, index]) =>
-      html("i", { "data-index": index, class: "tile", title: episodeName(episode) })));
+  const groups = new Map();
+  view.episodes.forEach((episode, index) => {
+    const name = `${episode.learner} ${episode.onset < 0 ? "undisturbed" : "disturbed"}`;
+    if (!groups.has(name)) groups.set(name, []);
+    groups.get(name).push(html("i", { "data-index": index, class: "tile", title: episodeName(episode) }));
   });
-  box.replaceChildren(...rows.filter(Boolean));
+  box.replaceChildren(...[...groups].map(([name, tiles]) =>
+    html("div", {}, html("span", {}, name), html("div", {}, tiles))));
   state.tiles = [];
   for (const tile of box.querySelectorAll("i")) state.tiles[tile.dataset.index] = tile;
 }
