@@ -14,7 +14,7 @@ from safeswitch import cli, doctor, registry, suite
 from safeswitch.console import console
 from safeswitch.doctor import Check
 
-COMMANDS = ("bench", "demos", "train", "evaluate", "gate", "list", "play", "doctor")
+COMMANDS = ("bench", "report", "demos", "train", "evaluate", "gate", "list", "play", "doctor")
 
 
 def run(capsys: Any, *arguments: str) -> tuple[int, str]:

@@ -85,7 +85,7 @@ def _plain(value: float) -> float | str | None:
 
 
 def _methods(rows: pd.DataFrame) -> dict[str, list[str]]:
-    """Method -> what sets it apart: `privileged`, `returns` (gives control back). Rules not installed here have none."""
+    """Method -> what sets it apart: `privileged`, `returns` (gives control back)."""
     about = {}
     for name in sorted(rows["method"].unique()):
         try:

@@ -83,7 +83,7 @@ def marks(view: View, rows: pd.DataFrame, folder: Path) -> list[Mark]:
         folder: of the results.
 
     Raises:
-        ValueError: a published threshold does not give the numbers of its row: folder and tables do not belong together.
+        ValueError: a published threshold does not give the numbers of its row: they are of different runs.
     """
     path = folder / "tables" / view.tables.task.name / FILE
     published = read_thresholds(path) if path.is_file() else None
@@ -129,7 +129,8 @@ def _written(view: View, rows: Mapping[tuple[str, str], Any], published: pd.Data
 
 
 def _recovered(view: View, rows: Mapping[tuple[str, str], Any], folder: Path) -> Iterator[Mark]:
-    """CEM's thresholds from cem_seeds.csv, absolute values from the rule's name; of one learner also the table's own."""
+    """CEM's thresholds from cem_seeds.csv, absolute values from the rule's name; of one learner also the leaderboard's.
+    """
     seeds = pd.read_csv(folder / "cem_seeds.csv") if (folder / "cem_seeds.csv").is_file() else None
     for (method, on), row in rows.items():
         rule, signal = method.partition("@")[0], signal_of(method)

@@ -30,7 +30,7 @@ def write_report(folder: Path) -> Path:
     if not board.is_file():
         raise ValueError(f"no leaderboard.csv in {folder}: run `make bench` first, or name another folder of results")
     rows = read_csv(board)
-    rows = rows.assign(calibrated_on=rows["calibrated_on"].fillna("") if "calibrated_on" in rows else "")
+    rows = rows.assign(calibrated_on=rows["calibrated_on"].astype(object).fillna("") if "calibrated_on" in rows else "")
     manifest = load_json(folder / "manifest.json") if (folder / "manifest.json").is_file() else {}
     tasks = [task for name, task in TASKS.items() if (rows["task"] == name).any()]
     if not tasks:

@@ -61,5 +61,5 @@ def write_thresholds(frame: pd.DataFrame, path: Path) -> Path:
 
 def read_thresholds(path: Path) -> pd.DataFrame:
     """Read what `write_thresholds` wrote, to the last bit."""
-    frame = pd.read_csv(path, float_precision="round_trip", keep_default_na=False, na_values=[""])
-    return frame.assign(calibrated_on=frame["calibrated_on"].fillna("")) if "calibrated_on" in frame else frame
+    frame = pd.read_csv(path, dtype={"threshold": str, "calibrated_on": str}, keep_default_na=False)
+    return frame.assign(threshold=frame["threshold"].map(float))  # Python's own reading is exact

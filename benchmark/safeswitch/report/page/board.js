@@ -15,7 +15,7 @@ const COLUMNS = [
   { key: "threshold", name: "Threshold", digits: 0, better: -1, title: "median over learners" },
   { key: "tuning_episodes", name: "Tuning", title: "episodes used to choose the threshold", digits: 0, better: 1 },
 ];
-const BAR = { width: 76, height: 20, edge: 3 };
+const BAR = { width: 68, height: 20, edge: 3 };
 
 function reference(board) {
   const rows = board.rows.filter((row) => /^(learner|expert|timer)$/.test(row.method));

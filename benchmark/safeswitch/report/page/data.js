@@ -85,12 +85,13 @@ class View {
     return step >= part.length[row] ? part.alone[row] : part.outcome[row * (this.horizon + 1) + step];
   }
 
-  // Scores at one threshold for each learner (an array by place), or at a common one (a number).
-  scores(thresholds) {
+  // Scores at one threshold for each learner (an array by place), or at a common one (a number); `each`: what becomes
+  // of every episode beside them.
+  scores(thresholds, each = false) {
     const common = typeof thresholds === "number";
     const sum = { n: this.size, undisturbed: this.undisturbed, success: 0, unknown: 0, steps: 0, armed: 0, handed: 0,
       false: 0, before: 0 };
-    const results = common ? null : [];
+    const results = each ? [] : null;
     for (const episode of this.episodes) {
       const { part, row, onset } = episode;
       const step = this.handover(episode, common ? thresholds : thresholds[episode.place]);

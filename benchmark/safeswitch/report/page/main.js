@@ -23,6 +23,7 @@ async function chooseTask(name) {
     $("signal").value = state.signal;
   }
   chooseCell(state.task.cells[0].name);
+  document.documentElement.dataset.task = name;
 }
 
 function chooseCell(name) {
@@ -104,7 +105,11 @@ function fitEpisode() {
   const key = `${state.view.cell}/${state.view.protocol}/${state.view.learner}`;
   if (state.shownView === key) return;
   state.shownView = key;
-  if ($("episode").value.startsWith("film-")) return;
+  const filmed = state.task.film && state.task.film.runs ? state.task.film.runs.findIndex((run) => run.driver.startsWith("cem")) : -1;
+  if (filmed >= 0) {
+    if (!$("episode").value.startsWith("film-") || !state.episode) $("episode").value = `film-${filmed}`;
+    return;
+  }
   const saved = state.now.results.findIndex(({ episode, ok }) => ok === 1 && !episode.part.alone[episode.row]);
   $("episode").value = String(Math.max(saved, 0));
 }

@@ -17,13 +17,29 @@ function drawEpisodes(state) {
   select.replaceChildren(...groups);
   select.value = before;
   if (select.selectedIndex < 0 && select.options.length) select.selectedIndex = 0;
+  drawDrivers(state);
   $("player").hidden = !select.options.length && !(film && film.all);
   const all = $("film");
   all.hidden = !(film && film.all);
   if (film && film.all) {
-    $("film-video").src = `${film.base}/${film.all}`;
+    $("film-video").src = `${film.base}/${film.all}#t=0.1`;
     all.querySelector("figcaption").textContent = `${state.task.name}: one test episode under each driver, each with its signal.`;
   }
+}
+
+// One button a filmed driver, for quick comparison.
+function drawDrivers(state) {
+  const { runs = [], seed } = state.task.film || {};
+  const buttons = runs.map((run, i) => {
+    const icon = svg("svg", { viewBox: "-8 -8 16 16", width: 14, height: 14, "aria-hidden": "true" }, glyph(run.driver));
+    const button = html("button", { type: "button", "data-film": `film-${i}`, "aria-pressed": "false" }, icon, run.driver,
+      html("span", { class: "at" }, run.success ? "succeeds" : "fails"));
+    button.addEventListener("click", () => openEpisode(`film-${i}`, false));
+    return button;
+  });
+  if (runs.length) buttons.unshift(html("span", { class: "key" }, `Film of seed ${seed}:`));
+  $("drivers").replaceChildren(...buttons);
+  $("drivers").hidden = !runs.length;
 }
 
 // What is drawn, whichever source it comes from: steps, not seconds.
@@ -63,12 +79,14 @@ function drawPlayer(state) {
   const episode = chosenEpisode(state);
   state.episode = episode;
   stop(state);
+  for (const button of $("drivers").querySelectorAll("button"))
+    button.setAttribute("aria-pressed", String(button.dataset.film === $("episode").value));
   $("trace").parentElement.hidden = !episode;
   $("screen").hidden = !(episode && episode.video);
   if (!episode) return;
   const video = $("video");
-  if (episode.video && video.getAttribute("src") !== episode.video) {
-    video.src = episode.video;
+  if (episode.video && video.getAttribute("src") !== `${episode.video}#t=0.05`) {
+    video.src = `${episode.video}#t=0.05`; // a time, so that the first picture is shown at once
     video.setAttribute("aria-label", `Film of the episode: ${episode.name}`);
   }
   if (!episode.video) video.removeAttribute("src");
@@ -117,10 +135,13 @@ function drawStrips(root, episode, x, dt) {
   const top = TRACE.height - TRACE.bottom + 22;
   const bar = (from, to, y, height, css, title) => to > from && root.append(svg("rect", { class: css, x: x(from * dt), y,
     width: x(to * dt) - x(from * dt), height }, title && svg("title", {}, title)));
+  const name = (words, y) => root.append(svg("text", { x: x.from - 8, y: y + 8, "text-anchor": "end" }, words));
   const handover = Math.min(episode.handover, episode.length);
+  name("driver", top);
   bar(0, handover, top, 9, "driver learner", "the learner drives");
   bar(handover, episode.counterfactual ? episode.horizon : episode.length, top, 9, "driver expert", "the expert drives");
   if (!episode.outcomes) return;
+  name("saved?", top + 13);
   let from = Math.max(episode.arm, 0);
   for (let s = from + 1; s <= episode.length; s++)
     if (s === episode.length || episode.outcomes[s] !== episode.outcomes[from]) {

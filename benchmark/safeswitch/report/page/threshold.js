@@ -71,7 +71,7 @@ function drawSweep(state) {
   $("slider").parentElement.style.cssText = `margin-left:${SWEEP.left - 9}px;margin-right:${SWEEP.right - 9}px`;
   $("sweep-caption").textContent = `Scores of a constant threshold on ${view.signal} over ${view.size} episodes, ` +
     `${cellTitle(state.cell)}, armed at ${state.protocol}. Signs above: thresholds that methods chose` +
-    `${view.learner < 0 && view.task.exact.learners.length > 1 ? ", in the middle of its learners’ own (small ticks)" : ""}.`;
+    `${view.learner < 0 && view.task.exact.learners.length > 1 ? ", each at the median of its learners’ own (small ticks)" : ""}.`;
   state.sweepNow = (value, scores) => {
     const px = Math.max(x.from, Math.min(x.to, x(value)));
     const [bar, ...dots] = cursor.children;
@@ -131,7 +131,7 @@ function drawMarkButtons(state) {
 function showNow(state) {
   const { view, mark } = state;
   const all = view.task.exact.learners.length > 1 && view.learner < 0;
-  const scores = view.scores(mark ? mark.at : state.threshold);
+  const scores = view.scores(mark ? mark.at : state.threshold, true);
   const value = mark ? mark.value : state.threshold;
   state.now = scores;
   state.sweepNow(value, scores);
@@ -232,7 +232,7 @@ function drawMosaic(state) {
   const box = $("mosaic");
   const groups = new Map();
   view.episodes.forEach((episode, index) => {
-    const name = `${episode.learner} ${episode.onset < 0 ? "undisturbed" : "disturbed"}`;
+    const name = `learner ${episode.learner}, ${episode.onset < 0 ? "undisturbed" : "disturbed"}`;
     if (!groups.has(name)) groups.set(name, []);
     groups.get(name).push(html("i", { "data-index": index, class: "tile", title: episodeName(episode) }));
   });
