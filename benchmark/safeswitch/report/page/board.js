@@ -4,7 +4,7 @@ const LEADING = 18;
 const ALWAYS = /^(learner|expert|timer|oracle-hindsight|oracle-onset|cem@total|best@total)$/;
 const COLUMNS = [
   { key: "return_mean", name: "Return", lo: "return_lo", hi: "return_hi", digits: 2, better: -1, zero: true },
-  { key: "skill", name: "Skill", lo: "skill_lo", hi: "skill_hi", digits: 2, better: -1, range: [-1, 1.5] },
+  { key: "skill", name: "Skill", lo: "skill_lo", hi: "skill_hi", digits: 2, better: -1, range: [-0.5, 1.5] },
   { key: "success", name: "Success", lo: "success_lo", hi: "success_hi", digits: 3, better: -1, range: [0, 1] },
   { key: "autonomy", name: "Autonomy", digits: 2, better: -1, fill: true },
   { key: "recovery", name: "Recovery", digits: 2, better: -1, title: "success where the learner alone fails" },
@@ -35,8 +35,8 @@ function drawBoard(state) {
   $("board-caption").textContent = `${task.name}, ${cellTitle(state.cell)}, armed at ${state.protocol}: ` +
     `${board.learners} learner${board.learners > 1 ? "s" : ""}, ${board.episodes} test episodes`;
   drawHead(state);
-  const scales = Object.fromEntries(COLUMNS.filter((c) => c.lo || c.fill).map((c) => [c.key, barScale(c, every)]));
   const zero = reference(board);
+  const scales = Object.fromEntries(COLUMNS.filter((c) => c.lo || c.fill).map((c) => [c.key, barScale(c, rows, zero)]));
   $("table").tBodies[0].replaceChildren(...rows.map((row) => boardRow(row, state, scales, zero)));
 }
 
@@ -67,16 +67,14 @@ function drawHead(state) {
   }
 }
 
-function barScale(column, rows) {
-  let [low, high] = column.range || [Infinity, -Infinity];
-  if (column.fill) [low, high] = [0, 1];
-  else if (!column.range)
-    for (const row of rows) {
-      low = Math.min(low, row[column.lo], row[column.key]);
-      high = Math.max(high, row[column.hi], row[column.key]);
-    }
-  if (column.key === "success")
-    low = Math.max(0, Math.min(...rows.map((row) => row.success_lo).filter((value) => !Number.isNaN(value))) - 0.02);
+// Of the rows that are shown, the bounds of the column's range apart: a few very bad methods must not hide the rest.
+function barScale(column, rows, zero) {
+  const [floor, ceiling] = column.range || [-Infinity, Infinity];
+  if (column.fill) return scale(BAR.edge, BAR.width - BAR.edge, 0, 1);
+  const values = rows.flatMap((row) => [row[column.lo], row[column.hi], row[column.key]]);
+  if (column.zero) values.push(zero);
+  const there = values.filter((value) => !Number.isNaN(value)).map((value) => Math.max(floor, Math.min(ceiling, value)));
+  const [low, high] = there.length ? [Math.min(...there), Math.max(...there)] : [0, 1];
   return scale(BAR.edge, BAR.width - BAR.edge, low, high > low ? high : low + 1);
 }
 
@@ -84,7 +82,8 @@ function boardRow(row, state, scales, zero) {
   const mark = row.traits.includes("privileged") ? "*" : row.traits.includes("returns") ? "↺" : "";
   const icon = svg("svg", { viewBox: "-8 -8 16 16", width: 16, height: 16, "aria-hidden": "true" }, glyph(row.method));
   const chosen = row.method === state.method;
-  const button = html("button", { type: "button", class: "method", "aria-pressed": String(chosen) }, row.method);
+  const button = html("button", { type: "button", class: "method", "aria-pressed": String(chosen),
+    title: row.on ? `calibrated on ${row.on}` : null }, row.method);
   button.addEventListener("click", () => chooseMethod(row.method));
   const head = html("th", { scope: "row" }, icon, button, mark && html("span", { class: "sign" }, mark));
   const cells = COLUMNS.map((column) => boardCell(row, column, scales[column.key], zero));

@@ -9,7 +9,9 @@ function cellTitle(cell) {
 
 async function chooseTask(name) {
   tasks[name] = tasks[name] || (await loadTask(name));
-  state.task = tasks[name];
+  Object.assign(state, { task: tasks[name], method: null });
+  const { made } = state.task;
+  $("made").textContent = made.commit ? `${name}: made by the ${made.profile} profile at commit ${made.commit.slice(0, 12)}, ${made.made}.` : "";
   const tags = { paper: "the paper’s", benign: "benign", "held-out": "held out" };
   options($("cell"), state.task.cells.map((cell) => [cell.name, cellTitle(cell) + (tags[cell.tag] ? ` (${tags[cell.tag]})` : "")]));
   const exact = state.task.exact;
@@ -225,8 +227,6 @@ async function main() {
   options($("task"), names.map((name) => [name, name]));
   listen();
   await chooseTask(names[0]);
-  const { made } = state.task;
-  $("made").textContent = made.commit ? `Made by the ${made.profile} profile at commit ${made.commit.slice(0, 12)}, ${made.made}.` : "";
   document.documentElement.dataset.ready = Math.round(performance.now());
 }
 

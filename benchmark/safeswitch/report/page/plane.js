@@ -11,10 +11,11 @@ function drawPlane(state) {
   const [x, y] = planeScales(rows, state, width, height);
   const root = svg("svg", { viewBox: `0 0 ${width} ${height}`, width, height, role: "group", "aria-labelledby": "plane-caption" });
   axes(root, x, y, { xName: "autonomy: share of steps that the learner drives", yName: "success", xTicks: width < 560 ? 4 : 8 });
+  let ring = null;
   if (state.sweep) {
     root.append(line(x, y, state.sweep.autonomy, state.sweep.success, { class: "reach" }));
     const now = svg("circle", { class: "now", r: 8, id: "plane-now" });
-    root.append(now);
+    ring = now;
     state.planeNow = (scores) => {
       const shown = !Number.isNaN(scores.success);
       filled(now, { cx: shown ? x(scores.autonomy) : -99, cy: shown ? y(scores.success) : -99 }, []);
@@ -25,6 +26,7 @@ function drawPlane(state) {
   points.forEach((row, i) => layer.append(planePoint(row, state, x, y, i, points.length)));
   roving(layer);
   root.append(layer, planeLabels(points, state, x, y, width));
+  if (ring) root.append(ring);
   holder.replaceChildren(root, planeLegend(points));
   $("plane-caption").textContent = `${state.task.name}, ${cellTitle(state.cell)}, armed at ${state.protocol}. ` +
     "Tab to the points and use the arrow keys to go through them; the leaderboard has the same numbers.";

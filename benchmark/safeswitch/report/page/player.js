@@ -135,7 +135,7 @@ function drawStrips(root, episode, x, dt) {
   const top = TRACE.height - TRACE.bottom + 22;
   const bar = (from, to, y, height, css, title) => to > from && root.append(svg("rect", { class: css, x: x(from * dt), y,
     width: x(to * dt) - x(from * dt), height }, title && svg("title", {}, title)));
-  const name = (words, y) => root.append(svg("text", { x: x.from - 8, y: y + 8, "text-anchor": "end" }, words));
+  const name = (words, y) => root.append(svg("text", { x: x.from - 6, y: y + 8, "text-anchor": "end" }, words));
   const handover = Math.min(episode.handover, episode.length);
   name("driver", top);
   bar(0, handover, top, 9, "driver learner", "the learner drives");

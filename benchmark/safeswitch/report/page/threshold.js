@@ -222,9 +222,14 @@ function showFails(scores, view) {
   const failed = [];
   scores.results.forEach((result, index) => result.ok === 0 && failed.push([index, result]));
   $("fails-title").textContent = failed.length === 1 ? "1 episode fails" : `${failed.length} episodes fail`;
-  const entries = failed.map(([index, result]) => new Option(`${episodeName(result.episode)} · ${reason(result, view)}`, index));
+  const entries = failed.map(([index, result]) => {
+    const { learner, seed, onset } = result.episode;
+    return new Option(`learner ${learner} · ${seed} · ${onset < 0 ? "undisturbed · " : ""}${reason(result, view)}`, index);
+  });
   $("fails").replaceChildren(...entries);
-  $("fails").disabled = !failed.length;
+  $("fails").hidden = !failed.length;
+  $("fails-how").textContent = failed.length ? "Learner, seed and reason. Choose one to see it below."
+    : "Every episode succeeds at this threshold.";
 }
 
 function drawMosaic(state) {
