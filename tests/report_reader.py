@@ -18,7 +18,9 @@ BLOCK = re.compile(r'<script type="text/plain" hidden data-task="([^"]+)" data-p
 
 def tasks_of(page: Path) -> dict[str, Any]:
     """Task -> its bundle, with the arrays under "data"."""
-    blocks = {(task, part): gzip.decompress(base64.b64decode(text)) for task, part, text in BLOCK.findall(page.read_text())}
+    blocks = {
+        (task, part): gzip.decompress(base64.b64decode(text)) for task, part, text in BLOCK.findall(page.read_text())
+    }
     found = {}
     for task in dict.fromkeys(task for task, _ in blocks):
         bundle = json.loads(blocks[task, "json"])
@@ -80,7 +82,9 @@ def same(written: float, exact: float) -> bool:
     """Whether a number of leaderboard.csv is `exact`, to its six significant digits."""
     if math.isnan(written) or math.isnan(exact):
         return math.isnan(written) and math.isnan(exact)
-    return written == exact or abs(written - exact) <= 0.5 * 10.0 ** (math.floor(math.log10(abs(exact))) - 5) * (1 + 1e-6)
+    return written == exact or abs(written - exact) <= 0.5 * 10.0 ** (math.floor(math.log10(abs(exact))) - 5) * (
+        1 + 1e-6
+    )
 
 
 def real(value: float | str | None) -> float:

@@ -34,11 +34,17 @@ def write_results(folder: Path, learners: int = 2, cells: int = 3, episodes: int
     rows, plain = [], []
     for view in tables_in(place, TASK).views():
         for learner, panel in view.panels.items():
-            nominal = panel.table.take(~panel.table.disturbed) if view.protocol == "start" else random_table(99, 9, False, SIGNALS)
+            nominal = (
+                panel.table.take(~panel.table.disturbed)
+                if view.protocol == "start"
+                else random_table(99, 9, False, SIGNALS)
+            )
             frames = []
             for method in METHODS:
                 calibrated = registry.make_method(method).calibrate(Calibration(panel, nominal, seed=learner))
-                frames.append(labelled(latched_rows(panel, calibrated), view.cell, view.protocol, method, learner, calibrated, ""))
+                frames.append(
+                    labelled(latched_rows(panel, calibrated), view.cell, view.protocol, method, learner, calibrated, "")
+                )
             rows += frames
             plain.append(plain_thresholds(panel, pd.concat(frames, ignore_index=True)))
     infos = {TASK.name: TaskInfo(HORIZON, 0.06)}

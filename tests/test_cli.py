@@ -143,6 +143,8 @@ def test_bench_writes_the_results(capsys: Any, micro: list[str], tmp_path: Path)
     for name in ("leaderboard.csv", "leaderboard.md", "signals.csv", "comparisons.csv", "manifest.json"):
         assert (tmp_path / "results" / name).stat().st_size > 0
     assert (tmp_path / "results" / "figures" / "cart-pole" / "cem-total-onset.png").exists()
+    assert (tmp_path / "results" / "tables" / "cart-pole" / "thresholds.csv").exists()
+    assert str(tmp_path / "results" / "report.html") in text and (tmp_path / "results" / "report.html").exists()
     before = (tmp_path / "results" / "leaderboard.csv").read_bytes()
     code, _ = run(capsys, "bench", *micro, "--results", str(tmp_path / "results"))
     assert code == 0 and (tmp_path / "results" / "leaderboard.csv").read_bytes() == before

@@ -53,7 +53,11 @@ def check_marks(folder: Path) -> dict[str, set[str]]:
 
 
 def _on(frame: pd.DataFrame) -> pd.Series:
-    return frame["calibrated_on"].astype(object).fillna("") if "calibrated_on" in frame else pd.Series("", index=frame.index)
+    return (
+        frame["calibrated_on"].astype(object).fillna("")
+        if "calibrated_on" in frame
+        else pd.Series("", index=frame.index)
+    )
 
 
 def test_numbers_at_every_mark_are_those_of_the_leaderboard(results: Path) -> None:
@@ -65,7 +69,9 @@ def test_numbers_at_every_mark_are_those_of_the_leaderboard(results: Path) -> No
 
 def test_any_threshold_hands_over_where_the_panel_does(results: Path) -> None:
     bundle = reader.tasks_of(results / NAME)["cart-pole"]
-    tables = {(name_of(view.cell), view.protocol): view for view in tables_in(results / "tables" / TASK.name, TASK).views()}
+    tables = {
+        (name_of(view.cell), view.protocol): view for view in tables_in(results / "tables" / TASK.name, TASK).views()
+    }
     rng = np.random.default_rng(5)
     for cell, protocol, signal in reader.views(bundle):
         panels = tables[cell, protocol].panels.values()
@@ -135,7 +141,9 @@ def test_the_same_results_give_the_same_bytes(results: Path, tmp_path: Path) -> 
     assert b"http://" not in before.replace(b"http://www.w3.org/2000/svg", b"") and b"https://" not in before
 
 
-def test_a_folder_without_results_is_an_error_that_says_what_to_do(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_a_folder_without_results_is_an_error_that_says_what_to_do(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
     assert cli.main(["report", "--results", str(tmp_path)]) == 2
     assert "leaderboard.csv" in capsys.readouterr().out
 

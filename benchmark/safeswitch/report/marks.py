@@ -129,8 +129,7 @@ def _written(view: View, rows: Mapping[tuple[str, str], Any], published: pd.Data
 
 
 def _recovered(view: View, rows: Mapping[tuple[str, str], Any], folder: Path) -> Iterator[Mark]:
-    """CEM's thresholds from cem_seeds.csv, absolute values from the rule's name; of one learner also the leaderboard's.
-    """
+    """CEM's thresholds from cem_seeds.csv, absolute values from names; with one learner also the leaderboard."""
     seeds = pd.read_csv(folder / "cem_seeds.csv") if (folder / "cem_seeds.csv").is_file() else None
     for (method, on), row in rows.items():
         rule, signal = method.partition("@")[0], signal_of(method)
