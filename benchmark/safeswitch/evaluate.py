@@ -27,7 +27,7 @@ REFERENCES = ("learner", "expert", "timer")
 def find_cell(task: Task, disturbance: str, severity: int) -> Cell:
     """The task's cell; an unknown one lists the valid ones, nearest first."""
     for cell in task.cells:
-        if cell.disturbance == disturbance and cell.severity in (severity, 0):
+        if cell.label == disturbance and cell.severity in (severity, 0):
             return cell
     raise unknown("cell", f"{task.name}/{disturbance}-{severity}", map(str, task.cells))
 
@@ -50,6 +50,8 @@ def evaluate(run: Run, method_id: str, disturbance: str, severity: int, protocol
         calibration = scoring_stages.calibration_of(loaded, run.task, cell, arming, seed)
         for name in names:
             calibrated = registry.make_method(name).calibrate(calibration)
+            if calibrated.rule is None:
+                raise ValueError(f"{name} cannot have what it asks for in cell {cell} under {arming}: the row is blank")
             rows = latched_rows(test, calibrated)
             frames.append(scoring_stages.labelled(rows, cell, arming, name, seed, calibrated, ""))
     table = leaderboard(stages.concat(frames), {run.task.name: run.task_info})
@@ -73,16 +75,20 @@ def play(run: Run, driver: str, disturbance: str, severity: int, protocol: str, 
     arming = _checked_arming(protocol)
     cell = find_cell(run.task, disturbance, severity)
     rule: Any = NeverSwitch()
+    queries = False
     if driver != "learner":
         on = run.task.calibrated_on(cell) if driver != "expert" else run.task.paper_cell
         loaded = run.tables_of(0, on).load(run.store, run.task, on)
         calibration = scoring_stages.calibration_of(loaded, run.task, on, arming, 0)
         rule = registry.make_method(driver).calibrate(calibration).rule
         if not hasattr(rule, "update"):
-            raise ValueError(f"{driver} needs hindsight and cannot drive an episode")
+            raise ValueError(f"{driver} needs hindsight, or is out of reach here, and cannot drive an episode")
+        queries = "expert-queries" in registry.make_method(driver).needs
     env = stages.make_env(run.task, cell, render_mode="rgb_array")
     learner, signals = run.trained[0].learner(run.task), run.trained[0].signals(run.task)
-    episode = run_episode(env, learner, signals, rule, env.make_expert(), seed, arming, record_snapshots=True)
+    adviser = env.make_expert() if queries else None
+    expert = env.make_expert()
+    episode = run_episode(env, learner, signals, rule, expert, seed, arming, record_snapshots=True, adviser=adviser)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_side_by_side([replay_frames(env, episode, driver)], path, round(1 / env.control_dt))
     env.close()

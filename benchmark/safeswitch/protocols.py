@@ -153,7 +153,10 @@ class SignalContext:
 
 @runtime_checkable
 class SwitchRule(Protocol):
-    """Decides the driver of each step from the signals, and from nothing else."""
+    """Decides the driver of each step from the signals, and from nothing else.
+
+    A rule may have `reads`, ids of the signals that it looks at: in plain episodes the others are then not computed.
+    """
 
     def reset(self, seed: int) -> None:
         """Start an episode."""
@@ -181,7 +184,8 @@ class Calibrated:
     """A method after calibration in one (learner, cell, arming).
 
     Attributes:
-        rule: the switch rule, ready to run.
+        rule: the switch rule, ready to run; None where the method cannot have what it asks for in this cell (for
+            example a share of expert steps): it is then left out there.
         threshold: its threshold in the signal's units; NaN where it has none.
         tuning_episodes: episodes spent on calibration (candidates x episodes for searches).
         expert_queries: expert-driven steps spent on calibration.

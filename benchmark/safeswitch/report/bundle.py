@@ -65,7 +65,7 @@ def _cell(cell: Cell, rows: pd.DataFrame) -> dict[str, Any]:
     about = "" if cell.tag == "none" else DISTURBANCES[cell.disturbance].describe(cell.severity)
     return {
         "name": name_of(cell),
-        "disturbance": cell.disturbance,
+        "disturbance": cell.label,
         "severity": cell.severity,
         "tag": cell.tag,
         "about": about,
@@ -74,7 +74,7 @@ def _cell(cell: Cell, rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def _rows_of(rows: pd.DataFrame, cell: Cell) -> pd.DataFrame:
-    return rows[(rows["disturbance"] == cell.disturbance) & (rows["severity"] == cell.severity)]
+    return rows[(rows["disturbance"] == cell.label) & (rows["severity"] == cell.severity)]
 
 
 def _plain(value: float) -> float | str | None:

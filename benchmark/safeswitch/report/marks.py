@@ -119,7 +119,7 @@ def _best(view: View, rows: Mapping[tuple[str, str], Any]) -> Iterator[Mark]:
 
 def _written(view: View, rows: Mapping[tuple[str, str], Any], published: pd.DataFrame) -> Iterator[Mark]:
     """Thresholds of methods that are the same threshold rule for every learner."""
-    cell = (view.cell.task, view.cell.disturbance, view.cell.severity, view.protocol)
+    cell = (view.cell.task, view.cell.label, view.cell.severity, view.protocol)
     here = published[(published[CELL] == list(cell)).all(axis=1)]
     for (method, on), group in here.groupby(["method", "calibrated_on"], sort=True):
         values = dict(zip(group["learner"], group["threshold"], strict=True))
@@ -150,7 +150,7 @@ def _of_cem(view: View, method: str, on: str, seeds: pd.DataFrame) -> list[float
     calibrated_on = str(paper) if on else str(view.cell)
     if calibrated_on != str(paper):
         return None
-    here = seeds[(seeds[CELL] == [paper.task, paper.disturbance, paper.severity, view.protocol]).all(axis=1)]
+    here = seeds[(seeds[CELL] == [paper.task, paper.label, paper.severity, view.protocol]).all(axis=1)]
     own = here[(here["method"] == method) & (here["cem_seed"] == here["learner"])].set_index("learner")["threshold"]
     there = set(view.tables.learners) <= set(own.index)
     return [float(own[learner]) for learner in view.tables.learners] if there else None

@@ -25,7 +25,7 @@ class TaskTables:
 
     Attributes:
         task: as in the suite.
-        tables: (name of a cell, learner seed) -> its test episodes; a name is `disturbance-severity`.
+        tables: (name of a cell, learner seed) -> its test episodes; a name is `label-severity`.
     """
 
     task: Task
@@ -96,8 +96,8 @@ class View:
 
 
 def name_of(cell: Cell) -> str:
-    """Name of a cell in the names of files: `disturbance-severity`."""
-    return f"{cell.disturbance}-{cell.severity}"
+    """Name of a cell in the names of files: `label-severity`."""
+    return f"{cell.label}-{cell.severity}"
 
 
 def table_name(cell: Cell, learner: int) -> str:

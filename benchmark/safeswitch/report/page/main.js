@@ -4,7 +4,8 @@ const state = { method: null, signal: "total", learner: -1, sort: { key: "return
 const tasks = {};
 
 function cellTitle(cell) {
-  return cell.severity ? `${cell.disturbance}, severity ${cell.severity}` : "no disturbance";
+  if (cell.severity) return `${cell.disturbance}, severity ${cell.severity}`;
+  return cell.disturbance === "none" ? "no disturbance" : cell.disturbance;
 }
 
 async function chooseTask(name) {
