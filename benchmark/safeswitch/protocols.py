@@ -153,10 +153,7 @@ class SignalContext:
 
 @runtime_checkable
 class SwitchRule(Protocol):
-    """Decides the driver of each step from the signals, and from nothing else.
-
-    A rule may have `reads`, ids of the signals that it looks at: in plain episodes the others are then not computed.
-    """
+    """Decides the driver of each step from the signals, and from nothing else."""
 
     def reset(self, seed: int) -> None:
         """Start an episode."""
@@ -190,6 +187,7 @@ class Calibrated:
         tuning_episodes: episodes spent on calibration (candidates x episodes for searches).
         expert_queries: expert-driven steps spent on calibration.
         log: arrays worth keeping, such as every CEM sample (name -> array).
+        reads: signals that the rule looks at, None for all of them: plain episodes compute no others.
     """
 
     rule: Any
@@ -197,6 +195,7 @@ class Calibrated:
     tuning_episodes: int = 0
     expert_queries: int = 0
     log: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    reads: tuple[str, ...] | None = None
 
 
 @runtime_checkable
