@@ -17,6 +17,7 @@ from safeswitch.pictures import STORY
 from safeswitch.report.marks import Mark, marks
 from safeswitch.report.pack import Order, Pack, levels, records
 from safeswitch.report.views import TaskTables, name_of, tables_in
+from safeswitch.scoring_stages import protocols_of
 from safeswitch.stages import make_env
 from safeswitch.suite import Cell, Task
 from safeswitch.tasks.disturbances import DISTURBANCES
@@ -144,7 +145,7 @@ def _signal(name: str, stacked: dict[Cell, HandoverTable], marked: Any, pack: Pa
     """One signal: its axis, traces, records under each arming, marks and margins."""
     runs = {}
     for cell, table in stacked.items():
-        for protocol in ("start",) if cell.tag == "none" else ("start", "onset"):
+        for protocol in protocols_of(cell):
             runs[name_of(cell), protocol] = records(Panel(table, protocol).running_max(name))
     views = {
         f"{name_of(cell)}/{protocol}": (
@@ -157,10 +158,10 @@ def _signal(name: str, stacked: dict[Cell, HandoverTable], marked: Any, pack: Pa
     compared += [np.array(mark.thresholds) for found, _ in views.values() for mark in found]
     compared += [np.array(limits) for _, margins in views.values() for limits in margins if limits]
     order = Order(np.concatenate(compared))
-    for (cell, protocol), (counts, steps, values) in runs.items():
-        pack.add(f"{cell}/{protocol}/{name}/count", counts, "uint8" if counts.max() < 256 else "int16")
-        pack.add(f"{cell}/{protocol}/{name}/step", steps, "uint8" if steps.max() < 256 else "int16")
-        pack.add(f"{cell}/{protocol}/{name}/value", order(values), "float32")
+    for (place, arming), (counts, steps, values) in runs.items():
+        pack.add(f"{place}/{arming}/{name}/count", counts, "uint8" if counts.max() < 256 else "int16")
+        pack.add(f"{place}/{arming}/{name}/step", steps, "uint8" if steps.max() < 256 else "int16")
+        pack.add(f"{place}/{arming}/{name}/value", order(values), "float32")
     axis = _axis(np.concatenate([table.signals[name].ravel() for table in stacked.values()]))
     for cell, table in stacked.items():
         pack.add(f"{name_of(cell)}/{name}/trace", levels(table.signals[name], *axis), "uint8")

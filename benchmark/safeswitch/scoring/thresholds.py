@@ -45,7 +45,7 @@ def _methods(rows: pd.DataFrame) -> Iterator[pd.DataFrame]:
 
 def _is_plain(panel: Panel, group: pd.DataFrame) -> bool:
     signal, threshold = signal_of(str(group["method"].iloc[0])), float(group["threshold"].iloc[0])
-    if signal not in panel.table.signals or np.isnan(threshold):
+    if signal is None or signal not in panel.table.signals or np.isnan(threshold):
         return False
     if not np.array_equal(group["seed"].to_numpy(), panel.table.seeds):
         raise ValueError("the rows of a method are not the episodes of the panel, in its order")
