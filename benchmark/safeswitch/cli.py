@@ -66,10 +66,34 @@ class Bench:
     def run(self) -> None:
         """Do it."""
         from safeswitch.publish import publish
+        from safeswitch.report import write_report
 
         for run in self.common.runs():
             folder = publish(run, self.results)
             console.print(f"[bold]{run.task.name}[/]: leaderboard in [cyan]{folder / 'leaderboard.md'}[/]")
+        console.print(f"report to explore in a browser: [cyan]{write_report(folder)}[/]")
+
+
+@dataclass
+class Report:
+    """Write report.html: one page without network that shows a folder of results, every threshold included.
+
+    Attributes:
+        results: folder with leaderboard.csv and tables/ (default: results/).
+        quiet: print errors only.
+    """
+
+    results: Path | None = None
+    quiet: bool = False
+
+    def run(self) -> None:
+        """Do it."""
+        from safeswitch.publish import default_folder
+        from safeswitch.report import write_report
+
+        console.quiet = self.quiet
+        path = write_report(self.results or default_folder("full"))
+        console.print(f"[cyan]{path}[/]: {path.stat().st_size / 1e6:.1f} MB")
 
 
 @dataclass
@@ -241,6 +265,7 @@ class Doctor:
 
 Command = (
     Annotated[Bench, tyro.conf.subcommand("bench")]
+    | Annotated[Report, tyro.conf.subcommand("report")]
     | Annotated[Demos, tyro.conf.subcommand("demos")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
