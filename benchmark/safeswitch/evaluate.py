@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from safeswitch.suite import Cell, Task
 
 REFERENCES = ("learner", "expert", "timer")
+GATE = 0.995
+"""Share of undisturbed handovers that must succeed before any result of a task means anything."""
 
 
 def find_cell(task: Task, disturbance: str, severity: int) -> Cell:

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 from rich.markup import escape
 
-from safeswitch import pictures, registry
-from safeswitch.console import console
+from safeswitch import durations, pictures, registry
+from safeswitch.console import log
 from safeswitch.files import load_frame, load_json, save_frame, save_json
 from safeswitch.handover.published import file_name, write_table
 from safeswitch.handover.table import HandoverTable
@@ -58,8 +58,9 @@ def publish(run: Run, folder: Path | None = None) -> Path:
     folder = (folder or default_folder(run.profile.name)).absolute()
     started = time.time()
     commit = git_commit()  # before anything is written into the checkout
+    run.plan, run.typical = run.stages, durations.stages(run.task.name, run.profile.name, folder)
     for reason in without_extra().values():
-        console.print(f"[yellow]{escape(reason)}[/]")
+        log.print(f"[yellow]{escape(reason)}[/]")
     scores, spread, figures = run.scores, run.spread, run.figures
     folder.mkdir(parents=True, exist_ok=True)
     for name in TABLES:
@@ -169,7 +170,7 @@ def _write_tables(run: Run, folder: Path) -> None:
     """Tables of the first three cells, to score latched rules without MuJoCo.
 
     In the full profile both splits, apart and with every outcome computed; otherwise the test episodes with the
-    outcomes that are known. Beside them, to the last bit, the thresholds of those methods that are a constant threshold.
+    outcomes that are known. Beside them, to the last bit, the thresholds of those methods that are a constant one.
     """
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -231,7 +232,11 @@ def _manifest(run: Run, folder: Path, commit: str, seconds: float) -> dict[str, 
         "episodes": {"calibrate": run.profile.calibrate, "test": run.profile.test},
         "episode_seeds": {split: index * SPLIT_SIZE for index, split in enumerate(SPLITS)},
         "stage_seconds": {
-            name: {"wall, this run": round(wall, 1), "work, when computed": round(run.work[name], 1)}
+            name: {
+                "wall, this run": round(wall, 1),
+                "work, when computed": round(run.work[name], 1),
+                "jobs": run.jobs[name],
+            }
             for name, wall in run.seconds.items()
         },
         "wall_seconds": round(seconds, 1),
