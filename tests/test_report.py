@@ -145,7 +145,7 @@ def test_a_folder_without_results_is_an_error_that_says_what_to_do(
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     assert cli.main(["report", "--results", str(tmp_path)]) == 2
-    assert "leaderboard.csv" in capsys.readouterr().out
+    assert "leaderboard.csv" in capsys.readouterr().err
 
 
 @given(st.lists(st.floats(allow_nan=False, width=64), min_size=1, max_size=30), st.integers(0, 3))
