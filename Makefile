@@ -33,8 +33,8 @@ demos: setup ## record the expert's demonstrations only (PROFILE=, TASK=, JOBS=)
 test: setup ## run the tests, without the slow ones
 	$(BIN)/python -m pytest -m "not slow" -n $(TEST_JOBS)
 
-test-slow: ## run the slow tests: packaging, long properties, full protocols, documentation, notebooks
-	@bash scripts/setup.sh dev,docs
+test-slow: ## run the slow tests: packaging, long properties, full protocols, the report in a browser, documentation
+	@bash scripts/setup.sh dev,browser,docs
 	$(BIN)/python -m pytest -m slow -n $(TEST_JOBS)
 
 perf: ## time the expert, pictures, decisions from images and the handover table, each beside a rival

@@ -54,7 +54,7 @@ def pins() -> dict[str, Version]:
 
 def test_constraints_pin_every_requirement_within_its_range(project: dict[str, Any]) -> None:
     extras = project["optional-dependencies"]
-    groups = ("dev", "docs", "perf", "rl")
+    groups = ("browser", "dev", "docs", "perf", "rl")
     listed = [*project["dependencies"], *(each for group in groups for each in extras[group])]
     for requirement in map(Requirement, listed):
         pinned = pins().get(canonicalize_name(requirement.name))

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import RenderableType
 from rich.markup import escape
 from rich.table import Table
 
@@ -88,6 +87,7 @@ class Bench:
     def run(self) -> None:
         """Do it."""
         from safeswitch.publish import default_folder, publish
+        from safeswitch.report import write_report
         from safeswitch.summary import announcement, summary
 
         started, runs = time.perf_counter(), self.common.runs()
@@ -95,8 +95,29 @@ class Bench:
         log.print("\n".join(announcement(runs, folder)), markup=False)
         for run in runs:
             publish(run, folder)
+        write_report(folder)
         data, shown = summary(runs, folder, time.perf_counter() - started)
         answer(data, *shown)
+
+
+@dataclass
+class Report(Output):
+    """Write report.html: one page without network that shows a folder of results, every threshold included.
+
+    Attributes:
+        results: folder with leaderboard.csv and tables/ (default: results/).
+    """
+
+    results: Path | None = None
+
+    def run(self) -> None:
+        """Do it."""
+        from safeswitch.publish import default_folder
+        from safeswitch.report import write_report
+
+        self.set()
+        path = write_report(self.results or default_folder("full"))
+        answer({"report": path}, f"[cyan]{path}[/]: {path.stat().st_size / 1e6:.1f} MB")
 
 
 @dataclass
@@ -173,7 +194,7 @@ class Gate:
         from safeswitch.evaluate import GATE, gate
 
         rows, passed = {}, True
-        shown: list[RenderableType] = []
+        shown: list[Table | str] = []
         for run in self.common.runs():
             rows[run.task.name] = gate(run, self.episodes, self.every)
             table = Table("check", "trials", "success", "95 % interval", title=run.task.name)
@@ -301,6 +322,7 @@ class Doctor:
 
 Command = (
     Annotated[Bench, tyro.conf.subcommand("bench")]
+    | Annotated[Report, tyro.conf.subcommand("report")]
     | Annotated[Demos, tyro.conf.subcommand("demos")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]

@@ -27,6 +27,8 @@ FILES = {
     "leaderboard.md": "every method in every cell, to read",
     "leaderboard.csv": "the same with every score and interval",
     "signals.csv": "how well each signal tells a disturbance",
+    "sightings.csv": "how far ahead each signal sees what stands in the way",
+    "left_out.csv": "thresholds learned on other disturbances",
     "comparisons.csv": "paired comparisons of methods",
     "cem_seeds.csv": "CEM's threshold over its seeds",
     "manifest.json": "commit, versions, seeds, times",
