@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.markup import escape
@@ -13,6 +13,10 @@ from rich.table import Table
 
 from safeswitch import registry, suite
 from safeswitch.console import console
+
+if TYPE_CHECKING:
+    from safeswitch.evaluation import Evaluation
+    from safeswitch.pipeline import Run
 
 
 @dataclass
@@ -99,30 +103,49 @@ class Train:
 
 
 @dataclass
-class Evaluate:
-    """Score one method in one cell, exactly, from the handover table.
+class Contestant:
+    """Who is scored, and where.
 
     Attributes:
-        method: id such as cem@total, or package.module:factory.
-        disturbance: disturbance of the cell.
+        learner: registered learner or package.module:factory (default: the task's own).
+        rule: id such as cem@total; rule and signal may each be package.module:factory.
+        signals: further signals to record; those that the rule says it reads are recorded anyway.
+        disturbance: disturbance of the cell (default: the paper's).
         severity: 1 to 5.
         protocol: onset or start.
     """
 
-    common: tyro.conf.OmitArgPrefixes[Common]
-    method: str = "cem@total"
-    disturbance: str = "cart-mass"
+    learner: str | None = None
+    rule: Annotated[str, tyro.conf.arg(aliases=["--method"])] = "cem@total"
+    signals: tuple[str, ...] = ()
+    disturbance: str | None = None
     severity: int = 3
     protocol: str = "onset"
 
+    def evaluate(self, run: Run) -> Evaluation:
+        """Score it in a run."""
+        from safeswitch.evaluation import evaluate
+
+        return evaluate(
+            run, self.rule, self.disturbance, self.severity, self.protocol, self.learner, tuple(self.signals)
+        )
+
+
+@dataclass
+class Evaluate:
+    """Score one learner and rule, the suite's or your own, in one cell."""
+
+    common: tyro.conf.OmitArgPrefixes[Common]
+    contestant: tyro.conf.OmitArgPrefixes[Contestant]
+
     def run(self) -> None:
         """Do it."""
-        from safeswitch.evaluate import evaluate
-
+        if self.contestant.learner and not self.common.task:
+            raise ValueError("a learner is for one task: add --task, for example --task cart-pole")
         for run in self.common.runs():
-            row = evaluate(run, self.method, self.disturbance, self.severity, self.protocol)
-            table = Table("score", "value", title=f"{self.method} in {self.disturbance}-{self.severity}")
-            for name, value in row.items():
+            found = self.contestant.evaluate(run)
+            table = Table("score", "value", title=f"{found.run.task.learner} with {found.method} in {found.cell}")
+            for name, value in found.scores.items():
                 table.add_row(str(name), f"{value:.4g}" if isinstance(value, float) else str(value))
             console.print(table)
 
@@ -173,7 +196,7 @@ class Play:
 
     Attributes:
         driver: learner, expert, or a method id such as cem@total.
-        disturbance: disturbance of the cell; none for the undisturbed task.
+        disturbance: disturbance of the cell (default: the paper's); none for the undisturbed task.
         severity: 1 to 5.
         seed: episode seed.
         out: file to write, .mp4 or .gif.
@@ -181,7 +204,7 @@ class Play:
 
     common: tyro.conf.OmitArgPrefixes[Common]
     driver: str = "cem@total"
-    disturbance: str = "cart-mass"
+    disturbance: str | None = None
     severity: int = 3
     protocol: str = "onset"
     seed: int = 0

@@ -15,7 +15,7 @@ from itertools import product
 
 from joblib import Parallel, delayed, parallel_config
 
-from safeswitch import publish
+from safeswitch import factories, publish
 from safeswitch.console import Progress
 from safeswitch.scoring.metrics import TaskInfo
 from safeswitch.scoring_stages import episodes_job, signals_job
@@ -72,7 +72,7 @@ class Run:
     @cached_property
     def learners(self) -> list[Job]:
         """One trained learner per learner seed."""
-        demonstrations = self.demonstrations
+        demonstrations = self.demonstrations if factories.wants_demonstrations(self.task.learner) else None
         jobs = [
             learner_job(self.store, self.task, self.profile, seed, demonstrations)
             for seed in range(self.profile.learners)
@@ -127,12 +127,11 @@ class Run:
         for group in ((none,), tuple(cell for cell in cells if cell != none)):  # the others share outcomes of `none`
             stage = []
             for trained, cell in product(self.trained, group):
-                counts: dict[Split, int] = {"test": self.profile.test}
-                if cell in calibrated_on:
-                    counts["calibrate"] = self.profile.calibrate
-                for split, count in counts.items():
+                splits: tuple[Split, ...] = ("test", "calibrate") if cell in calibrated_on else ("test",)
+                for split in splits:
                     twins = chunks.get((trained.seed, none, split), ())
-                    jobs = table_jobs(self.store, self.task, cell, split, count, trained, twins)
+                    seeds = self.profile.seeds_of(split)
+                    jobs = table_jobs(self.store, self.task, cell, split, seeds, trained, twins)
                     chunks[trained.seed, cell, split] = jobs
                     stage += jobs
             self.finish("handover tables", stage)
@@ -189,11 +188,11 @@ class Run:
     def _further_tables(self) -> dict[tuple[int, Cell], tuple[str, ...]]:
         """Tables of the cells in which only signals are scored; none where only the picture is disturbed."""
         profile = self.profile
-        count = min(profile.signal_episodes, profile.test)
+        seeds = profile.seeds_of("test")[: profile.signal_episodes]
         chunks = {
             (trained.seed, cell): []
             if only_seen(cell)
-            else table_jobs(self.store, self.task, cell, "test", count, trained)
+            else table_jobs(self.store, self.task, cell, "test", seeds, trained)
             for trained in self.trained
             for cell in self.task.severities(*profile.signal_severities)
         }

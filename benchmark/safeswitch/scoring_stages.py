@@ -66,7 +66,7 @@ def _score_episodes(
             if method.latched:
                 rows = latched_rows(test, calibrated)
             else:
-                rows = _plain_rows(task, cell, trained, test, calibrated.rule)
+                rows = plain_rows(task, cell, trained, test, calibrated.rule)
             on = "" if task.calibrated_on(cell) == cell else str(task.calibrated_on(cell))
             frames.append(labelled(rows, cell, protocol, method_id, trained.seed, calibrated, on))
             logs.update({f"{protocol}|{method_id}|{name}": value for name, value in calibrated.log.items()})
@@ -100,7 +100,7 @@ def _panel(table: HandoverTable, nominal: HandoverTable, cell: Cell, protocol: A
     return Panel(concatenate([table, nominal]) if protocol == "start" else table, protocol)
 
 
-def _plain_rows(task: Task, cell: Cell, trained: Trained, test: Panel, rule: Any) -> pd.DataFrame:
+def plain_rows(task: Task, cell: Cell, trained: Trained, test: Panel, rule: Any) -> pd.DataFrame:
     """Rules that give control back have no table: drive the same episodes."""
     driver, signals = trained.learner(task), trained.signals(task)
     envs = {True: make_env(task, cell), False: make_env(task, task.none_cell)}
