@@ -20,6 +20,7 @@ import numpy as np
 
 from safeswitch import demos, registry
 from safeswitch.files import load_json, save_json
+from safeswitch.seeding import stream
 
 if TYPE_CHECKING:
     from safeswitch.tasks.base import TaskEnv
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 PARAMETERS = ("demonstrations", "seed")
 """What a factory that is a function may ask for, by these names."""
 RECIPE = "factory.json"
-PROBED = 3
+PROBED = 10
 """Steps on which a learner that is made again is compared with the one that was made before."""
 
 
@@ -131,6 +132,7 @@ def probe(learner: Any, env: TaskEnv, name: str) -> np.ndarray:
     shape = env.simulator.action_shape
     env.reset(seed=0)
     learner.reset(0)
+    pushes = stream(0, "probe").uniform(-1.0, 1.0, (PROBED, *shape))
     rows = []
     for step in range(PROBED):
         prediction = learner.predict(env.observe(), step)
@@ -142,7 +144,7 @@ def probe(learner: Any, env: TaskEnv, name: str) -> np.ndarray:
             if not np.isnan(variance).all() and (variance.shape != shape or not (variance >= 0).all()):
                 raise ValueError(f"learner {name!r} gives {kind} {variance!r}: {shape} numbers >= 0, or nothing at all")
         rows.append(np.concatenate([action, *(np.broadcast_to(each, shape) for each in variances)]))
-        env.advance(np.zeros(shape))
+        env.advance(pushes[step])
     return np.stack(rows)
 
 
