@@ -163,8 +163,8 @@ def _manifest(run: Run, folder: Path, commit: str, seconds: float) -> dict[str, 
         "commit": commit,
         "profile": run.profile.name,
         "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        "versions": {"python": platform.python_version(), **{name: _version(name) for name in LIBRARIES}},
-        "hardware": {"machine": platform.machine(), "processor": _processor(), "workers": run.workers},
+        "versions": {"python": platform.pythoninstalled_version(), **{name: installed_version(name) for name in LIBRARIES}},
+        "hardware": {"machine": platform.machine(), "processor": processor(), "workers": run.workers},
         "learner_seeds": list(range(run.profile.learners)),
         "episodes": {"calibrate": run.profile.calibrate, "test": run.profile.test},
         "episode_seeds": {split: index * SPLIT_SIZE for index, split in enumerate(SPLITS)},
@@ -193,7 +193,7 @@ def git_commit() -> str:
         return "unknown"
 
 
-def _processor() -> str:
+def processor() -> str:
     """Name of the processor, as far as the system tells."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
@@ -202,7 +202,8 @@ def _processor() -> str:
         return platform.processor()
 
 
-def _version(distribution: str) -> str:
+def installed_version(distribution: str) -> str:
+    """Version of a distribution, or "not installed"."""
     try:
         return version(distribution)
     except PackageNotFoundError:

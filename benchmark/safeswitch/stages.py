@@ -101,7 +101,10 @@ def learner_job(store: Store, task: Task, profile: Profile, seed: int, demonstra
         settings["predictions"] = factories.fingerprint(task.learner, seed, env)
         env.close()
     inputs = [] if demonstrations is None else [demonstrations.key]
-    key = store.key("learner", settings, inputs, [source_of("learner", task.learner)])
+    code = [source_of("learner", task.learner)]
+    if not factories.is_kept(registry.find("learner", task.learner)):
+        code.append("safeswitch.factories")  # which then decides what the result holds
+    key = store.key("learner", settings, inputs, code)
     arguments = (task, options, seed, str(store.folder(demonstrations.key)) if demonstrations else "")
     return Job("learner", f"{task.name} learner {seed}", key, _train, arguments)
 
