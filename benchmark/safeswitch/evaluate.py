@@ -37,7 +37,9 @@ def checked_arming(protocol: str) -> Arming:
     raise unknown("protocol", protocol, ARMINGS)
 
 
-def play(run: Run, driver: str, disturbance: str | None, severity: int, protocol: str, seed: int, path: Path) -> Episode:
+def play(
+    run: Run, driver: str, disturbance: str | None, severity: int, protocol: str, seed: int, path: Path
+) -> Episode:
     """Drive one episode and write its film.
 
     Args:

@@ -98,8 +98,8 @@ def with_method(run: Run, method: Method, method_id: str, learner: str | None, s
     alone = [signal for signal in read if profile.learners == 1 and trained.needs_members(signal)]
     if alone:
         raise ValueError(
-            f"signal {alone[0]!r} needs learners of several seeds; there is one: use --profile full, and a factory that "
-            "takes a seed"
+            f"signal {alone[0]!r} needs learners of several seeds; there is one: use --profile full, and a factory "
+            "that takes a seed"
         )
     if kept == run.task.signals and own:
         return run
@@ -152,7 +152,7 @@ def check_rule(name: str, method: Method, calibrated: Calibrated, panel: Panel) 
     rule = calibrated.rule
     if not hasattr(rule, "update"):
         if "privileged" not in method.needs:
-            raise ValueError(f"rule {name!r} cannot drive an episode (it has no `update`): add 'privileged' to its needs")
+            raise ValueError(f"rule {name!r} cannot drive an episode (no `update`): add 'privileged' to its needs")
         return
     steps = panel.handover_of(rule)
     for episode in range(len(panel)):
@@ -165,8 +165,8 @@ def check_rule(name: str, method: Method, calibrated: Calibrated, panel: Panel) 
             )
         if panel.executed(np.array([first] * len(panel)))[episode] != steps[episode]:
             raise ValueError(
-                f"rule {name!r} contradicts itself in episode {panel.table.seeds[episode]}: asked step by step it hands "
-                f"over at {first}, its handover_steps say {steps[episode]}"
+                f"rule {name!r} contradicts itself in episode {panel.table.seeds[episode]}: asked step by step it "
+                f"hands over at {first}, its handover_steps say {steps[episode]}"
             )
 
 

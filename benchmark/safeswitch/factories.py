@@ -108,8 +108,8 @@ def load(name: str, folder: Path, make_env: Any) -> Any:
     env.close()
     if not same:
         raise ValueError(
-            f"learner {name!r} was made twice and predicts two things: its factory must be a function of demonstrations "
-            "and seed, with random numbers from a generator that `seed` seeds (or write a class with train, save, load)"
+            f"learner {name!r} was made twice and predicts two things: its factory must be a function of its "
+            "arguments, with random numbers from a generator that `seed` seeds (or a class with train, save, load)"
         )
     return learner
 
@@ -138,7 +138,9 @@ def probe(learner: Any, env: TaskEnv, name: str) -> np.ndarray:
         prediction = learner.predict(env.observe(), step)
         action = np.asarray(prediction.action, float)
         if action.shape != shape or not np.isfinite(action).all():
-            raise ValueError(f"learner {name!r} predicts the action {prediction.action!r}: {shape} finite numbers needed")
+            raise ValueError(
+                f"learner {name!r} predicts the action {prediction.action!r}: needs {shape} finite numbers"
+            )
         variances = [np.asarray(prediction.epistemic_var, float), np.asarray(prediction.aleatoric_var, float)]
         for kind, variance in zip(("epistemic_var", "aleatoric_var"), variances, strict=True):
             if not np.isnan(variance).all() and (variance.shape != shape or not (variance >= 0).all()):

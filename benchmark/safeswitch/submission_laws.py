@@ -1,7 +1,7 @@
-"""What must hold of the episodes of latched rules: a table that was made up, or edited, breaks one of these sooner or later.
+"""What must hold of the episodes of latched rules: a table that was made up, or edited, soon breaks one of these laws.
 
-o(s), the outcome of handing over at step s, is one function for all latched rules on an episode: two rules that hand over
-at the same step end alike, all handovers up to `t*_first` succeed, and none after `t*_last` does.
+o(s), the outcome of handing over at step s, is one function for all latched rules on an episode: two rules that hand
+over at the same step end alike, all handovers up to `t*_first` succeed, and none after `t*_last` does.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ def check_laws(episodes: pd.DataFrame, info: TaskInfo, give_back: Collection[str
     """
     frame = prepare(episodes, {task: info for task in episodes["task"].unique()})
     for name in TRAJECTORY:
-        _hold(f"every method has the same {name}", frame, frame.groupby(EPISODE)[name].transform("nunique", dropna=False) == 1)
+        values = frame.groupby(EPISODE)[name].transform("nunique", dropna=False)
+        _hold(f"every method has the same {name}", frame, values == 1)
     for law, holds in {**_trajectory(frame, info), **_references(frame, info)}.items():
         _hold(law, frame, holds)
     latched = frame[~frame["method"].isin(list(give_back))]

@@ -1,4 +1,4 @@
-"""Submissions: one JSON file with a method's scores in one cell, and the outcomes of every episode that they follow from.
+"""Submissions: one JSON file with a method's scores in one cell, and the outcomes that they follow from.
 
 `write` makes one of an evaluation; `read` takes nothing on trust. It recomputes every score from the episodes, holds
 these against what can and what cannot happen in an episode (`submission_laws`), and against the code of the benchmark
@@ -60,7 +60,7 @@ UNSCORED = ("task", "disturbance", "severity", "protocol", "method")
 """Columns of the leaderboard that are no scores."""
 
 
-class Refused(ValueError):
+class Refused(ValueError):  # noqa: N818 (a verdict, not a fault)
     """A submission that is not merged, and why."""
 
 
@@ -211,7 +211,12 @@ def _meaning(source: str) -> list[Any]:
     tree = ast.parse(source)
     for node in ast.walk(tree):
         body = getattr(node, "body", None)
-        if isinstance(body, list) and body and isinstance(body[0], ast.Expr) and isinstance(body[0].value, ast.Constant):
+        if (
+            isinstance(body, list)
+            and body
+            and isinstance(body[0], ast.Expr)
+            and isinstance(body[0].value, ast.Constant)
+        ):
             body.pop(0)
     rows = []
     for node in ast.walk(tree):
@@ -249,13 +254,15 @@ def _episodes(content: Mapping[str, Any], info: TaskInfo) -> pd.DataFrame:
     signal = signal_of(method)
     wanted = {*REFERENCES, method, *([f"best@{signal}"] if signal else [])}
     if set(frame["method"]) != wanted:
-        raise Refused(f"inconsistent: episodes must be of {sorted(wanted)}, got {sorted(map(str, set(frame['method'])))}")
+        raise Refused(
+            f"inconsistent: episodes must be of {sorted(wanted)}, got {sorted(set(map(str, frame['method'])))}"
+        )
     profile = content["profile"]
     seeds = suite.episode_seeds("test", profile["test"]) if 0 < profile["test"] <= suite.SPLIT_SIZE else []
     if set(frame["learner"]) != set(range(profile["learners"])) or set(frame["seed"]) != set(seeds):
         raise Refused(
             f"inconsistent: profile {profile['name']!r} of {profile['learners']} learners and {profile['test']} test "
-            "episodes is not what the episodes hold: they must be the first ones of the test split, for every learner"
+            "episodes is not what the episodes hold: these must be the first ones of the test split, for every learner"
         )
     twice = 2 if content["cell"]["protocol"] == "start" and content["cell"]["disturbance"] != "none" else 1
     if len(frame) != len(wanted) * profile["learners"] * profile["test"] * twice:
@@ -281,7 +288,7 @@ def _checked_scores(content: Mapping[str, Any], frame: pd.DataFrame, cell: str, 
         given = float("nan") if given is None else given
         if isinstance(given, bool) or not isinstance(given, NUMBER + TEXT) or _spelled(given) != _spelled(value):
             raise Refused(
-                f"inconsistent: scores.{key} is {given!r} and its episodes give {_spelled(value) or 'no value'} ({cell})"
+                f"inconsistent: scores.{key} is {given!r} and its episodes give {_spelled(value) or 'no value'}, {cell}"
             )
     if stated:
         raise Refused(f"malformed: the scores {sorted(stated)} are unknown")

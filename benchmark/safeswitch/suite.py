@@ -14,8 +14,9 @@ Tag = Literal["paper", "none", "benign", "held-out", "other"]
 
 SPLITS: tuple[Split, ...] = ("train", "design", "calibrate", "pilot", "test", "kept-back")
 """The order decides the seeds: append, never insert. Which seeds of `kept-back` are used depends on a maintainer's
-secret: reruns of submissions are tested on them (`safeswitch.verification`). `pilot` is retired: it was the test split of a first trial of the whole benchmark, after which the length of the
-cart-pole's episodes was revised. Nothing that is published comes from it."""
+secret: reruns of submissions are tested on them (`safeswitch.verification`). `pilot` is retired: it was the test split
+of a first trial of the whole benchmark, after which the length of the cart-pole's episodes was revised. Nothing that is
+published comes from it."""
 SPLIT_SIZE = 1_000_000
 """Seeds per split: split k owns [k SPLIT_SIZE, (k + 1) SPLIT_SIZE), so no two splits share one."""
 

@@ -199,7 +199,8 @@ def _cells(row: Mapping[str, Any]) -> list[str]:
     def interval(name: str, low: str, high: str) -> str:
         return number(name) if pd.isna(row[low]) else f"{number(name)} [{number(low)}, {number(high)}]"
 
-    safe = {name: str(row[name]).replace("|", "\\|").replace("\n", " ") for name in ("name", "authors", "learner", "rule")}
+    words = ("name", "authors", "learner", "rule")
+    safe = {name: str(row[name]).replace("|", "\\|").replace("\n", " ") for name in words}
     return [
         f"{safe['name']} ({safe['authors']})",
         f"`{safe['learner']}`, `{safe['rule']}`",
