@@ -63,17 +63,25 @@ class Bench:
 
     Attributes:
         results: where the tables go (default: results/ for the full profile, else results/local/<profile>/).
+        tensorboard: folder for curves of training and CEM, written afterwards; results do not depend on it.
     """
 
     common: tyro.conf.OmitArgPrefixes[Common]
     results: Path | None = None
+    tensorboard: Path | None = None
 
     def run(self) -> None:
         """Do it."""
+        from safeswitch import board
         from safeswitch.publish import publish
 
+        if self.tensorboard:
+            board.check_installed()
         for run in self.common.runs():
             folder = publish(run, self.results)
+            if self.tensorboard:
+                board.write_training(run, self.tensorboard)
+                console.print(f"curves in [cyan]{board.write_searches(run, self.tensorboard)}[/]")
             console.print(f"[bold]{run.task.name}[/]: leaderboard in [cyan]{folder / 'leaderboard.md'}[/]")
 
 
@@ -92,13 +100,24 @@ class Demos:
 
 @dataclass
 class Train:
-    """Train the learners only."""
+    """Train the learners only.
+
+    Attributes:
+        tensorboard: folder for curves of training, written afterwards; results do not depend on it.
+    """
 
     common: tyro.conf.OmitArgPrefixes[Common]
+    tensorboard: Path | None = None
 
     def run(self) -> None:
         """Do it."""
+        from safeswitch import board
+
+        if self.tensorboard:
+            board.check_installed()
         for run in self.common.runs():
+            if self.tensorboard:
+                console.print(f"curves in [cyan]{board.write_training(run, self.tensorboard)}[/]")
             for job in run.learners:
                 console.print(f"{job.label}: {run.store.folder(job.key)}")
 
