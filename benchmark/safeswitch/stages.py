@@ -146,17 +146,18 @@ def table_jobs(
     task: Task,
     cell: Cell,
     split: Split,
-    seeds: Sequence[int],
+    seeds: Sequence[int] | int,
     trained: Trained,
     twins: Sequence[Job] = (),
 ) -> list[Job]:
-    """The handover table of one (cell, learner) on episode seeds of a split, in chunks of episodes.
+    """The handover table of one (cell, learner) on episode seeds of a split (or its first ones), in chunks of episodes.
 
     Outcomes are computed here for the cells whose tables are used again and again (`Cell.complete`); elsewhere they
     are computed when a rule first asks for them. Where the disturbance is only seen, those up to the onset are taken
     from `twins`, finished jobs of the undisturbed cell.
     """
     twins = twins if only_seen(cell) else ()
+    seeds = episode_seeds(split, seeds) if isinstance(seeds, int) else seeds
     code = [*PHYSICS, *task.code(), *HANDOVER, source_of("learner", task.learner), *signal_code(task)]
     jobs = []
     for index, first in enumerate(range(0, len(seeds), CHUNK)):

@@ -24,8 +24,9 @@ import pandas as pd
 from safeswitch import __version__, registry, suite
 from safeswitch.evaluate import find_cell
 from safeswitch.evaluation import REFERENCES
+from safeswitch.expert.codegen import processor
 from safeswitch.files import jsonable, save_json
-from safeswitch.publish import LIBRARIES, git_commit, installed_version, processor
+from safeswitch.publish import git_commit
 from safeswitch.scoring.leaderboard import format_number, leaderboard
 from safeswitch.scoring.metrics import CELL, COLUMNS, TaskInfo, signal_of
 from safeswitch.stages import HANDOVER, PHYSICS, make_env, source_of
@@ -129,7 +130,7 @@ def write(found: Evaluation, folder: Path, name: str, authors: str, url: str = "
         "episodes": episodes,
         "manifest": {
             "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-            "versions": {"python": platform.python_version(), **{each: installed_version(each) for each in LIBRARIES}},
+            "versions": {"python": platform.python_version(), **found.run.store.key("versions", {}).recipe["libraries"]},
             "hardware": {"machine": platform.machine(), "processor": processor()},
         },
         "hashes": {
