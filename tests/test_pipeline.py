@@ -52,14 +52,14 @@ def jobs_of(store: Store, task: Task = TASK, members: tuple[Key, ...] = ()) -> d
     fits = stages.fits_job(store, task, 0, learner, demonstrations) if fitted_signals(task) else None
     trained = Trained(str(store.root), 0, learner.key, fits and fits.key, members)
     keys = {
-        (each, split): tuple(job.key for job in stages.table_jobs(store, task, each, split, MICRO.seeds_of(split), trained))
+        (each, split): tuple(job.key for job in stages.table_jobs(store, task, each, split, 2, trained))
         for each in (cell, task.none_cell)
         for split in ("calibrate", "test")
     }
     tables = CellTables(
         keys[cell, "calibrate"], keys[task.none_cell, "calibrate"], keys[cell, "test"], keys[task.none_cell, "test"]
     )
-    table = stages.table_jobs(store, task, cell, "test", MICRO.seeds_of("test"), trained)[0]
+    table = stages.table_jobs(store, task, cell, "test", 2, trained)[0]
     episodes = scoring_stages.episodes_job(store, task, cell, trained, tables, give_back=False)
     signals = scoring_stages.signals_job(store, task, cell, trained, tables.test, tables.test_nominal)
     scores = pipeline.publish.scores_job(store, task, None, [episodes], [signals])  # type: ignore[arg-type]
@@ -121,7 +121,7 @@ def test_keys_depend_on_settings_and_not_on_the_folder(tmp_path: Path) -> None:
 
 
 def test_what_is_fitted_depends_on_learner_and_demonstrations_and_tables_depend_on_it(tmp_path: Path) -> None:
-    assert "signal-fits" not in jobs_of(Store(tmp_path)), "the state cart-pole fits nothing"
+    assert "signal-fits" not in jobs_of(Store(tmp_path)), "nothing is fitted without such signals"
     jobs = jobs_of(Store(tmp_path), NOVEL)
     assert jobs["signal-fits"].key.recipe["inputs"] == [jobs["learner"].key, jobs["demonstrations"].key]
     assert jobs["signal-fits"].key.recipe["settings"]["signals"] == ["mahalanobis"], "once for its smoothed versions"

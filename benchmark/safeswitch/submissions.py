@@ -24,7 +24,6 @@ import pandas as pd
 from safeswitch import __version__, registry, suite
 from safeswitch.evaluate import find_cell
 from safeswitch.evaluation import REFERENCES
-from safeswitch.expert.codegen import processor
 from safeswitch.files import jsonable, save_json
 from safeswitch.publish import git_commit
 from safeswitch.scoring.leaderboard import format_number, leaderboard
@@ -130,8 +129,8 @@ def write(found: Evaluation, folder: Path, name: str, authors: str, url: str = "
         "episodes": episodes,
         "manifest": {
             "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-            "versions": {"python": platform.python_version(), **found.run.store.key("versions", {}).recipe["libraries"]},
-            "hardware": {"machine": platform.machine(), "processor": processor()},
+            "versions": {"python": platform.python_version(), **found.run.store.key("none", {}).recipe["libraries"]},
+            "hardware": {"machine": platform.machine(), "processor": platform.processor()},
         },
         "hashes": {
             "episodes": content_hash(episodes),
