@@ -17,7 +17,7 @@ from safeswitch.tasks.disturbances import DISTURBANCES, SEVERITIES, offered
 
 pytestmark = pytest.mark.rendering
 
-VISUAL = [name for name in offered("cart-pole-image") if visual.IMAGES == DISTURBANCES[name].tasks]
+VISUAL = [name for name in offered("cart-pole-image") if issubclass(DISTURBANCES[name], visual.Visual)]
 OBJECTS = ["object", "object-held-out", "object-passing", "object-far"]
 ONSET = 12
 

@@ -127,8 +127,10 @@ def test_info_has_the_same_keys_and_types_always(env_id: str, disturbance: str |
         assert type(info["is_success"]) is bool and type(info["disturbed"]) is bool
         assert type(info["step"]) is int and info["step"] == step
         assert type(info["onset"]) is int
-        assert info["onset"] == (-1 if disturbance is None else env.onset)
-        assert info["disturbed"] == (disturbance is not None and step >= info["onset"])
+        # A placed disturbance has T for its onset until it comes into view.
+        pending = disturbance is not None and env.disturbance.placed and (env.onset is None or step < env.onset)
+        assert info["onset"] == (-1 if disturbance is None else env.horizon if pending else env.onset)
+        assert info["disturbed"] == (disturbance is not None and not pending and step >= info["onset"])
         assert info["state"].dtype == info["parameters"].dtype == np.float64
         assert info["parameters"].shape == (len(env.parameter_names),)
     infos[0]["state"][:] = math.nan  # infos are copies
@@ -207,8 +209,9 @@ def test_actions_are_clipped(env_id: str) -> None:
 @pytest.mark.parametrize(("env_id", "disturbance"), CELLS)
 def test_advance_is_step_without_looking(env_id: str, disturbance: str | None) -> None:
     env, other = make(env_id, disturbance=disturbance), make(env_id, disturbance=disturbance)
-    env.reset(seed=9, options={"onset": 3} if disturbance else None)
-    other.reset(seed=9, options={"onset": 3} if disturbance else None)
+    options = None if disturbance is None or env.disturbance.placed else {"onset": 3}
+    env.reset(seed=9, options=options)
+    other.reset(seed=9, options=options)
     action = np.full(env.action_space.shape, 0.05)
     for _ in range(10):
         env.step(action)

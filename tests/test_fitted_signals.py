@@ -14,10 +14,12 @@ from safeswitch import registry
 from safeswitch.demos import Demonstrations
 from safeswitch.files import load_arrays, save_arrays
 from safeswitch.protocols import FittedSignal, Prediction, Signal, SignalContext, TrainingFeatures
-from safeswitch_baselines.signals import KNN, RND, DynamicsResidual, Mahalanobis, fitting, make_signal
+from safeswitch_baselines.signals import KNN, RND, Discrepancy, DynamicsResidual, Mahalanobis, fitting, make_signal
+from safeswitch_baselines.signals.discrepancy import EPISODES, TAU
 
 OBSERVATION, ZERO = np.zeros(4), np.zeros(1)
-FITTED = (Mahalanobis, KNN, RND, DynamicsResidual)
+NOVELTY = (Mahalanobis, KNN, RND, DynamicsResidual)
+FITTED = (*NOVELTY, Discrepancy)
 
 
 @dataclass
@@ -157,7 +159,7 @@ def test_knn_keeps_a_random_part_of_many_training_features() -> None:
     assert one.shape == (5_000, 6) and not np.array_equal(one, other)
 
 
-@pytest.mark.parametrize("signal", FITTED)
+@pytest.mark.parametrize("signal", NOVELTY)
 def test_features_off_the_training_set_stand_out(signal: Any) -> None:
     made = signal(signal.fit(training(curve(2_000)), 0))
     near, far = curve(100, seed=1), np.random.default_rng(2).permuted(curve(100, seed=1), axis=1)
@@ -242,6 +244,46 @@ def test_dynamics_are_learned_within_episodes_alone() -> None:
     np.testing.assert_array_equal(same["model"], DynamicsResidual.fit(training(states @ READOUT, actions), 0)["model"])
 
 
+# --- discrepancy ---
+
+
+class Erring(Known):
+    """Its action is 0; the labels of the demonstrations differ from it where the first feature is positive."""
+
+
+def erring(count: int, seed: int) -> tuple[Any, Any]:
+    features, _, _ = correlated(count, seed=seed)
+    return features, np.where(features[:, :1] > 0, 2 * TAU, 0.5 * TAU)
+
+
+def test_discrepancy_is_the_chance_that_the_learner_deviates() -> None:
+    features, labels = erring(6_000, 0)
+    demonstrations = training(features, labels).demonstrations
+    signal = Discrepancy(Discrepancy.fit(TrainingFeatures(Erring(), demonstrations), 0))
+    fresh, labels = erring(1_000, 1)
+    p, unsafe = values(signal, fresh), labels[:, 0] > TAU
+    assert ((p >= 0) & (p <= 1)).all() and np.mean((p > 0.5) == unsafe) > 0.9
+    assert np.mean(p) == pytest.approx(np.mean(unsafe), abs=0.05), "probabilities add up"
+
+
+def test_discrepancy_asks_the_learner_on_the_first_demonstrations_in_order() -> None:
+    class Asked(Known):
+        def __init__(self) -> None:
+            self.calls: list[tuple[int, int]] = []
+
+        def reset(self, seed: int) -> None:
+            self.episode = seed
+
+        def predict(self, observation: Any, step: int) -> Prediction:
+            self.calls.append((self.episode, step))
+            return super().predict(observation, step)
+
+    features, labels = erring(5 * (EPISODES + 20), 2)
+    learner = Asked()
+    Discrepancy.fit(TrainingFeatures(learner, training(features, labels, length=5).demonstrations), 0)
+    assert learner.calls == [(episode, step) for episode in range(EPISODES) for step in range(5)]
+
+
 # --- all of them ---
 
 
@@ -268,7 +310,7 @@ def test_fits_are_the_same_bits_for_the_same_seed_whatever_the_threads(signal: A
     assert all(np.asarray(array).dtype != object for array in one.values())
 
 
-@pytest.mark.parametrize("signal", [KNN, RND, DynamicsResidual])
+@pytest.mark.parametrize("signal", [KNN, RND, DynamicsResidual, Discrepancy])
 def test_the_seed_draws_what_is_random(signal: Any) -> None:
     features = training(curve(5_200))
     one, other = signal.fit(features, 0), signal.fit(features, 1)

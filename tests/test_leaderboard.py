@@ -246,7 +246,7 @@ def test_markdown_has_the_headline_the_tables_and_the_words(tmp_path: Path) -> N
     assert "no contest" in text
     assert text.count("<details>") == text.count("</details>") == 1  # `push`, the paper's cell is open
     assert "*`best@total`* †" in text
-    columns = "method,return,skill,success,autonomy,recovery,harm,timely,false alarms,tuning episodes"
+    columns = "method,needs,return,skill,success,autonomy,recovery,harm,timely,false alarms,tuning episodes"
     header = f"| {columns.replace(',', ' | ')} |"
     assert header in text
     for line in text.splitlines():

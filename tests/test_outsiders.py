@@ -69,7 +69,7 @@ class Lean:
 
 class Falling:
     """A bare rule on that signal: the expert (1) takes over when the pole leans back from upright."""
-    signals = ("outsider:Lean",)
+    reads = ("outsider:Lean",)
     def reset(self, seed): self.low, self.driver = np.inf, 0
     def arm(self, step): return 0
     def update(self, step, signals):
@@ -187,7 +187,7 @@ def test_new_weights_of_a_ready_made_learner_are_a_new_learner(outsider: Path, t
 def test_a_bare_rule_is_a_method_and_methods_are_called_with_their_signal(outsider: Path) -> None:
     method = registry.make_method("outsider:Falling")
     assert isinstance(method, Method) and method.latched and method.needs == frozenset()
-    assert method.signals == ("outsider:Lean",)
+    assert method.reads == ("outsider:Lean",)
     assert not registry.make_method("outsider:GivesBack").latched
     assert registry.make_method("safeswitch_baselines.rules.cem:CEM@total").id == "cem@total"
     for name, message in (

@@ -6,7 +6,7 @@ import importlib.metadata
 
 import pytest
 
-from safeswitch import perf
+from safeswitch import perf, perf_crocoddyl
 
 
 @pytest.mark.slow
@@ -23,8 +23,8 @@ def test_without_crocoddyl_the_expert_is_timed_alone(monkeypatch: pytest.MonkeyP
     def missing(name: str) -> None:
         raise importlib.metadata.PackageNotFoundError(name)
 
-    monkeypatch.setattr(perf.importlib.metadata, "distribution", missing)
-    monkeypatch.setattr(perf.shutil, "which", lambda name: f"/usr/bin/{name}")
+    monkeypatch.setattr(perf_crocoddyl.importlib.metadata, "distribution", missing)
+    monkeypatch.setattr(perf_crocoddyl.shutil, "which", lambda name: f"/usr/bin/{name}")
     results = perf.expert_benchmark(horizon=34, repeats=2)
     assert "pip install crocoddyl" in results["skipped"]
     assert results["us_per_iteration"] > 0 and "crocoddyl_us_per_iteration" not in results

@@ -121,7 +121,7 @@ def test_keys_depend_on_settings_and_not_on_the_folder(tmp_path: Path) -> None:
 
 
 def test_what_is_fitted_depends_on_learner_and_demonstrations_and_tables_depend_on_it(tmp_path: Path) -> None:
-    assert "signal-fits" not in jobs_of(Store(tmp_path)), "the state cart-pole fits nothing"
+    assert "signal-fits" not in jobs_of(Store(tmp_path)), "nothing is fitted without such signals"
     jobs = jobs_of(Store(tmp_path), NOVEL)
     assert jobs["signal-fits"].key.recipe["inputs"] == [jobs["learner"].key, jobs["demonstrations"].key]
     assert jobs["signal-fits"].key.recipe["settings"]["signals"] == ["mahalanobis"], "once for its smoothed versions"

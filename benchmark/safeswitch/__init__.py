@@ -17,6 +17,8 @@ __version__ = "0.1.0"
 ENTRY_POINTS: dict[str, str] = {
     "SafeSwitch/CartPole-v0": "safeswitch.tasks.cart_pole:CartPoleEnv",
     "SafeSwitch/CartPoleImage-v0": "safeswitch.tasks.cart_pole_image:CartPoleImageEnv",
+    "SafeSwitch/RallyCar-v0": "safeswitch.tasks.rally_car:RallyCarEnv",
+    "SafeSwitch/RallyCarImage-v0": "safeswitch.tasks.rally_car_image:RallyCarImageEnv",
 }
 """Environment id -> where its class is, imported when the environment is made."""
 

@@ -1,4 +1,4 @@
-"""The command line: bench, demos, train, evaluate, submit, leaderboard, verify, gate, list, play, doctor."""
+"""The command line: bench, demos, train, evaluate, submit, leaderboard, verify, gate, expert-report and others."""
 
 from __future__ import annotations
 
@@ -301,6 +301,35 @@ class Gate:
 
 
 @dataclass
+class ExpertReport:
+    """Drive the rally car's expert: laps, avoidance against distance at handover, milliseconds, errors of its model.
+
+    Attributes:
+        task: rally-car-image or rally-car.
+        laps: laps in one go, on each track at each speed.
+        episodes: episodes with an obstacle, on each track at each speed.
+        out: folder of the tables and the figure (default: results/local/expert/<task>).
+    """
+
+    task: str = "rally-car-image"
+    laps: int = 50
+    episodes: int = 100
+    out: Path | None = None
+
+    def run(self) -> None:
+        """Do it."""
+        from safeswitch.expert_report import report
+
+        folder = self.out or Path("results/local/expert") / self.task
+        for name, rows in report(self.task, folder, self.laps, self.episodes, console.print).items():
+            table = Table(*rows.columns, title=name)
+            for row in rows.itertuples(index=False):
+                table.add_row(*(f"{value:.3g}" if isinstance(value, float) else str(value) for value in row))
+            console.print(table)
+        console.print(f"tables and figure in [cyan]{folder}[/]")
+
+
+@dataclass
 class List:
     """List tasks with their cells, disturbances, learners, signals, methods and profiles."""
 
@@ -367,6 +396,7 @@ Command = (
     | Annotated[Leaderboard, tyro.conf.subcommand("leaderboard")]
     | Annotated[Verify, tyro.conf.subcommand("verify")]
     | Annotated[Gate, tyro.conf.subcommand("gate")]
+    | Annotated[ExpertReport, tyro.conf.subcommand("expert-report")]
     | Annotated[List, tyro.conf.subcommand("list")]
     | Annotated[Play, tyro.conf.subcommand("play")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]

@@ -24,7 +24,7 @@ def find_cell(task: Task, disturbance: str | None, severity: int) -> Cell:
     """The task's cell, by default its paper's; an unknown one lists the valid ones, nearest first."""
     disturbance = task.paper_cell.disturbance if disturbance is None else disturbance
     for cell in task.cells:
-        if cell.disturbance == disturbance and cell.severity in (severity, 0):
+        if cell.label == disturbance and cell.severity in (severity, 0):
             return cell
     raise unknown("cell", f"{task.name}/{disturbance}-{severity}", map(str, task.cells))
 
@@ -56,16 +56,20 @@ def play(
     arming = checked_arming(protocol)
     cell = find_cell(run.task, disturbance, severity)
     rule: Any = NeverSwitch()
+    queries = False
     if driver != "learner":
         on = run.task.calibrated_on(cell) if driver != "expert" else run.task.paper_cell
         loaded = run.tables_of(0, on).load(run.store, run.task, on)
         calibration = scoring_stages.calibration_of(loaded, run.task, on, arming, 0)
         rule = registry.make_method(driver).calibrate(calibration).rule
         if not hasattr(rule, "update"):
-            raise ValueError(f"{driver} needs hindsight and cannot drive an episode")
+            raise ValueError(f"{driver} needs hindsight, or is out of reach here, and cannot drive an episode")
+        queries = "expert-queries" in registry.make_method(driver).needs
     env = stages.make_env(run.task, cell, render_mode="rgb_array")
     learner, signals = run.trained[0].learner(run.task), run.trained[0].signals(run.task)
-    episode = run_episode(env, learner, signals, rule, env.make_expert(), seed, arming, record_snapshots=True)
+    adviser = env.make_expert() if queries else None
+    expert = env.make_expert()
+    episode = run_episode(env, learner, signals, rule, expert, seed, arming, record_snapshots=True, adviser=adviser)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_side_by_side([replay_frames(env, episode, driver)], path, round(1 / env.control_dt))
     env.close()

@@ -82,7 +82,7 @@ def with_method(run: Run, method: Method, method_id: str, learner: str | None, s
 
     The task's own learner keeps the task's signals, so that what `bench` has computed is used.
     """
-    wanted = [signal_of(method_id), *getattr(method, "signals", ()), *signals]
+    wanted = [signal_of(method_id), *getattr(method, "reads", ()), *signals]
     read = dict.fromkeys(signal for signal in wanted if signal)
     for signal in read:
         registry.find("signal", registry.base_signal(signal))
@@ -119,11 +119,13 @@ def score_episodes(run: Run, method_id: str, cell: Cell, arming: Arming) -> pd.D
         for name in names:
             method = registry.make_method(name)
             calibrated = method.calibrate(calibration)
+            if calibrated.rule is None:
+                raise ValueError(f"{name} cannot have what it asks for in cell {cell} under {arming}: the row is blank")
             if method.latched:
                 check_rule(name, method, calibrated, test)
                 rows = latched_rows(test, calibrated)
             else:
-                rows = scoring_stages.plain_rows(run.task, cell, run.trained[seed], test, calibrated.rule)
+                rows = scoring_stages.plain_rows(run.task, cell, run.trained[seed], test, method, calibrated.rule)
             frames.append(scoring_stages.labelled(rows, cell, arming, name, seed, calibrated, ""))
     return stages.concat(frames)
 

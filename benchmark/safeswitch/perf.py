@@ -4,7 +4,7 @@ Both minimise the same generated cost over the same generated dynamics with Gaus
 model is C++ (`perf_crocoddyl.cpp`) that calls generated C, compiled with the flags of the expert's own code. Its
 library is used as pip installs it, on one thread. Timings of the two alternate, so that a busy machine slows both.
 
-* *us per iteration*: both solve the swing-up from the same first trajectory, for a fixed number of iterations.
+* *us per iteration*: both solve the swing-up (the swerve) from the same first trajectory, for some iterations.
 * *us per warm step*: both start from the same shifted plans along an episode, and stop at the first iteration whose
   cost is within 1e-6 of the optimum. Steps where one of them ends in another local minimum are left out and counted.
 
@@ -13,26 +13,21 @@ Run ``python -m safeswitch.perf``. crocoddyl and Eigen's headers come from ``pip
 
 from __future__ import annotations
 
-import ctypes
 import importlib.metadata
-import shutil
-import subprocess
-import tempfile
 import time
 from collections.abc import Callable
-from pathlib import Path
+from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from safeswitch.expert.cart_pole_model import PARAMETERS as PARAMETER_NAMES
 from safeswitch.expert.cart_pole_model import SWINGS, SwingCandidates, dynamics, make_cart_pole_expert, residuals
-from safeswitch.expert.codegen import FLAGS, find_compiler, source
-from safeswitch.expert.ddp import DDPSolver, Problem, Solution, make_solver
-from safeswitch.expert.graph import expanded
+from safeswitch.expert.ddp import DDPSolver, Solution, make_solver
+from safeswitch.expert.rally_car_model import RallyCarExpert, make_rally_car_expert
+from safeswitch.perf_crocoddyl import Crocoddyl, UnavailableError
 from safeswitch.perf_handover import handover_benchmark
 from safeswitch.perf_rendering import decision_benchmark, rendering_benchmark
 from safeswitch.tasks.cart_pole import CartPoleConfig
@@ -42,19 +37,35 @@ Array = NDArray[np.float64]
 TASK = CartPoleConfig()
 PARAMETERS = np.array([getattr(TASK, name) for name in PARAMETER_NAMES])
 HANGING = np.array([0.0, 0.0, np.pi - 0.05, 0.0])
+RALLY_S = 50.0  # [m]
+RALLY = np.array([23.9, 1.9, 0.34, 0.23, 1.0, 0.0, RALLY_S + 4.5, -0.3, 0.3])  # an obstacle ahead
 EQUAL_COST = 1e-6  # relative
-ITERATIONS = 15  # of a timed swing-up; neither solver has converged by then
 WARM_STEPS = 60
 NEVER = 1e-300  # crocoddyl wants a positive stopping threshold
-INSTALL = "pip install crocoddyl==3.2.1 cmeel-eigen"
 
 
-class UnavailableError(RuntimeError):
-    """The comparison cannot run here; the message says what to install."""
+@dataclass(frozen=True)
+class Setting:
+    """A problem that both solvers solve.
+
+    Attributes:
+        solver: the expert's.
+        parameters: (np,) of the model.
+        x: (N + 1, nx), u: (N, nu), feasible trajectory that both start from, and end in the same optimum.
+        noise: (nx,) standard deviation of the states of an episode of warm steps.
+        iterations: of a timed solve; neither solver has converged by then.
+    """
+
+    solver: DDPSolver
+    parameters: Array
+    x: Array
+    u: Array
+    noise: tuple[float, ...]
+    iterations: int
 
 
 def expert_benchmark(horizon: int = 50, repeats: int = 40) -> dict[str, Any]:
-    """Time the expert, and crocoddyl beside it where it is installed.
+    """Time the cart-pole's expert, and crocoddyl beside it where it is installed.
 
     Args:
         horizon: controls of the swing-up on which iterations are timed.
@@ -63,75 +74,114 @@ def expert_benchmark(horizon: int = 50, repeats: int = 40) -> dict[str, Any]:
     Returns:
         Plain numbers and strings. ``skipped`` says why the comparison is missing; its keys are then absent.
     """
-    results: dict[str, Any] = {"horizon": horizon, **expert_steps(repeats)}
-    solver = swing_up_solver(horizon)
-    results["compiled"] = solver.is_compiled
-    start = first_plan(solver)
-    ours = _timer(lambda: solve(solver, *start, ITERATIONS, 0.0))
-    results["us_per_iteration"] = median(ours() for _ in range(repeats)) / ITERATIONS
+    mpc = make_cart_pole_expert(TASK.control_dt, rail=TASK.rail)
+    steps = expert_steps(mpc.reset, lambda state: (mpc.action(state, PARAMETERS), mpc.plan_x[1])[1], HANGING, repeats)
+    return {"horizon": horizon, **steps, **solver_benchmark(swing_up(horizon), repeats)}
+
+
+def rally_car_benchmark(repeats: int = 40) -> dict[str, Any]:
+    """The same for the rally car's expert: steering around an obstacle 4 m ahead at 4 m/s."""
+    expert = make_rally_car_expert()
+    mpc, state = expert.mpc, np.array([RALLY_S, 0.0, 0.0, 4.0, 0.0, 0.0, 0.0])
+
+    def step(state: Array) -> Array:
+        expert.action(state, RALLY)
+        s, e_y, e_psi, v_y, r = mpc.plan_x[1]
+        return np.array([s, e_y, e_psi, 4.0, v_y, r, 0.0])
+
+    steps = expert_steps(expert.reset, step, state, repeats)
+    expert.reset()
+    expert.action(state, RALLY)  # shows the solver the track and the obstacle
+    return {"horizon": mpc.solver.problem.horizon, **steps, **solver_benchmark(swerve(expert), repeats)}
+
+
+def solver_benchmark(setting: Setting, repeats: int) -> dict[str, Any]:
+    """Microseconds of an iteration of the solver, and crocoddyl's beside it."""
+    results: dict[str, Any] = {"compiled": setting.solver.is_compiled}
+    ours = iteration_timer(setting)
+    results["us_per_iteration"] = median(ours() for _ in range(repeats))
     try:
-        results.update(compare(solver, repeats))
+        results.update(compare(setting, repeats))
     except UnavailableError as reason:
         results["skipped"] = str(reason)
     return results
 
 
-def expert_steps(repeats: int) -> dict[str, float]:
-    """Microseconds of a whole `MPC.action` call in Python: cold, and warm along an episode (model = plant)."""
-    mpc = make_cart_pole_expert(TASK.control_dt, rail=TASK.rail)
+def expert_steps(
+    reset: Callable[[], None], step: Callable[[Array], Array], start: Array, repeats: int
+) -> dict[str, float]:
+    """Microseconds of a whole step in Python: cold, and warm along an episode (model = plant).
+
+    Args:
+        reset: makes the next step a cold start.
+        step: state -> planned next state.
+        start: first state of each episode.
+        repeats: cold starts; the first three go on for an episode.
+    """
     cold: list[float] = []
     warm: list[float] = []
     for episode in range(repeats):
-        mpc.reset()
-        state = HANGING
+        reset()
+        state = start
         for i in range(WARM_STEPS if episode < 3 else 1):
             begin = time.perf_counter()
-            mpc.action(state, PARAMETERS)
+            state = step(state)
             (warm if i else cold).append(1e6 * (time.perf_counter() - begin))
-            state = mpc.plan_x[1]
     return {"us_per_cold_start": median(cold), "us_per_warm_action": median(warm)}
 
 
-def swing_up_solver(horizon: int) -> DDPSolver:
-    """The expert's solver for `horizon` controls."""
-    stage, terminal = residuals(TASK.rail)
-    return make_solver("cart_pole", dynamics(TASK.control_dt), stage, terminal, horizon, -1.0, 1.0)
-
-
-def first_plan(solver: DDPSolver) -> tuple[Array, Array]:
-    """Feasible states and controls from which the swing-up is timed: the roll-out of an energy-shaping swing.
+def swing_up(horizon: int) -> Setting:
+    """The cart-pole's swing-up from the roll-out of an energy-shaping swing.
 
     From here both solvers end in the same optimum; from arbitrary controls each may find its own.
     """
+    stage, terminal = residuals(TASK.rail)
+    solver = make_solver("cart_pole", dynamics(TASK.control_dt), stage, terminal, horizon, -1.0, 1.0)
     swing = SwingCandidates(solver.problem, TASK.control_dt)(HANGING, PARAMETERS)[-len(SWINGS)]
     plan = solver.solve(HANGING, PARAMETERS, swing.u, iterations=0)
-    return plan.x, plan.u
+    return Setting(solver, PARAMETERS, plan.x, plan.u, (0.01, 0.05, 0.01, 0.05), 15)
 
 
-def solve(solver: DDPSolver, x: Array, u: Array, iterations: int, tolerance: float) -> None:
+def swerve(expert: RallyCarExpert) -> Setting:
+    """The rally car's way around an obstacle, from the roll-out of a first plan that passes it on the left."""
+    solver, inputs = expert.mpc.solver, expert.mpc.solver.kernel.inputs
+    x0, parameters = inputs["x0"].copy(), inputs["p"].copy()
+    first = expert.mpc.candidates(x0, parameters)[1]
+    K = np.broadcast_to(first.K, (solver.problem.horizon, solver.problem.nu, solver.problem.nx))
+    plan = solver.solve(x0, parameters, first.u, first.x, K, iterations=0)
+    return Setting(solver, parameters, plan.x, plan.u, (0.0, 0.01, 0.01, 0.02, 0.05), 8)
+
+
+def solve(setting: Setting, x: Array, u: Array, iterations: int, tolerance: float) -> None:
     """Our solver from the trajectory x (N + 1, nx), u (N, nu), without feedback gains, as crocoddyl's `solve`."""
-    problem, inputs = solver.problem, solver.kernel.inputs
-    inputs["x0"][:], inputs["p"][:], inputs["gains_init"][:] = x[0], PARAMETERS, 0.0
-    inputs["plan_init"][:, : problem.nx] = x
-    inputs["plan_init"][:-1, problem.nx :] = u
+    solver, inputs = setting.solver, setting.solver.kernel.inputs
+    nx = solver.problem.nx
+    inputs["x0"][:], inputs["p"][:], inputs["gains_init"][:] = x[0], setting.parameters, 0.0
+    inputs["plan_init"][:, :nx] = x
+    inputs["plan_init"][:-1, nx:] = u
     solver.run(iterations, tolerance)
 
 
-def compare(solver: DDPSolver, repeats: int) -> dict[str, Any]:
-    """Numbers of crocoddyl, and the ratios of ours to them."""
-    rival = Crocoddyl(solver.problem)
-    x, u = first_plan(solver)
-    solve(solver, x, u, 200, 1e-13)
-    our_cost = float(solver.kernel.outputs["info"][0])
-    rival_cost = rival.solve(x, u, 500, 1e-15)[0]
+def iteration_timer(setting: Setting) -> Callable[[], float]:
+    """A function that solves and returns the microseconds of an iteration."""
+    timer = _timer(lambda: solve(setting, setting.x, setting.u, setting.iterations, 0.0))
+    return lambda: timer() / float(setting.solver.kernel.outputs["info"][1])
 
-    ours, theirs = _timer(lambda: solve(solver, x, u, ITERATIONS, 0.0)), []
-    times = []
+
+def compare(setting: Setting, repeats: int) -> dict[str, Any]:
+    """Numbers of crocoddyl, and the ratios of ours to them."""
+    solver, parameters, x, u = setting.solver, setting.parameters, setting.x, setting.u
+    rival = Crocoddyl(solver.problem)
+    solve(setting, x, u, 200, 1e-13)
+    our_cost = float(solver.kernel.outputs["info"][0])
+    rival_cost = rival.solve(parameters, x, u, 500, 1e-15)[0]
+
+    ours, times, theirs = iteration_timer(setting), [], []
     for _ in range(repeats):
-        times.append(ours() / ITERATIONS)
-        _, iterations, seconds = rival.solve(x, u, ITERATIONS, NEVER)
+        times.append(ours())
+        _, iterations, seconds = rival.solve(parameters, x, u, setting.iterations, NEVER)
         theirs.append(1e6 * seconds / iterations)
-    warm_ours, warm_theirs = warm_steps(solver, rival, max(repeats // 8, 3))
+    warm_ours, warm_theirs = warm_steps(setting, rival, max(repeats // 8, 3))
     return {
         "crocoddyl": importlib.metadata.version("crocoddyl"),
         "cost": our_cost,
@@ -147,21 +197,20 @@ def compare(solver: DDPSolver, repeats: int) -> dict[str, Any]:
     }
 
 
-def warm_steps(solver: DDPSolver, rival: Crocoddyl, repeats: int) -> tuple[list[float], list[float]]:
+def warm_steps(setting: Setting, rival: Crocoddyl, repeats: int) -> tuple[list[float], list[float]]:
     """Microseconds of each solver at each warm step, from the same shifted plan to the same cost."""
-    horizon = solver.problem.horizon
-    x, u = first_plan(solver)
-    best = solver.solve(x[0], PARAMETERS, u, iterations=200)
+    solver, parameters, horizon = setting.solver, setting.parameters, setting.solver.problem.horizon
+    best = solver.solve(setting.x[0], parameters, setting.u, iterations=200)
     noise = np.random.default_rng(0)
     ours, theirs = [], []
     for _ in range(WARM_STEPS):
         # The next state is disturbed; the shifted plan is rolled out from it with its gains, once for both.
-        state = best.x[1] + noise.normal(size=4) * [0.01, 0.05, 0.01, 0.05]
+        state = best.x[1] + noise.normal(size=len(setting.noise)) * setting.noise
         shift = np.minimum(np.arange(1, horizon + 1), horizon - 1)
         x_init = best.x[np.minimum(np.arange(1, horizon + 2), horizon)]
-        start = solver.solve(state, PARAMETERS, best.u[shift], x_init, best.K[shift], iterations=0)
-        best = solver.solve(state, PARAMETERS, start.u, start.x, iterations=200, tolerance=1e-12)
-        times = equal_cost_times(solver, rival, start, best.cost * (1 + EQUAL_COST) + 1e-9, repeats)
+        start = solver.solve(state, parameters, best.u[shift], x_init, best.K[shift], iterations=0)
+        best = solver.solve(state, parameters, start.u, start.x, iterations=200, tolerance=1e-12)
+        times = equal_cost_times(setting, rival, start, best.cost * (1 + EQUAL_COST) + 1e-9, repeats)
         if times is not None:
             ours.append(times[0])
             theirs.append(times[1])
@@ -169,21 +218,25 @@ def warm_steps(solver: DDPSolver, rival: Crocoddyl, repeats: int) -> tuple[list[
 
 
 def equal_cost_times(
-    solver: DDPSolver, rival: Crocoddyl, start: Solution, goal: float, repeats: int
+    setting: Setting, rival: Crocoddyl, start: Solution, goal: float, repeats: int
 ) -> tuple[float, float] | None:
     """Microseconds of each until the cost `goal`; None if one of them ended in another local minimum."""
-    needed = _first(lambda n: _our_cost(solver, start.x, start.u, n), goal)
-    rival_needed = _first(lambda n: rival.solve(start.x, start.u, n, NEVER)[0], goal)
+
+    def theirs(iterations: int) -> tuple[float, int, float]:
+        return rival.solve(setting.parameters, start.x, start.u, iterations, NEVER)
+
+    needed = _first(lambda n: _our_cost(setting, start.x, start.u, n), goal)
+    rival_needed = _first(lambda n: theirs(n)[0], goal)
     if needed == 0 or rival_needed == 0:
         return None
-    timer = _timer(lambda: solve(solver, start.x, start.u, needed, 0.0))
-    pairs = [(timer(), 1e6 * rival.solve(start.x, start.u, rival_needed, NEVER)[2]) for _ in range(repeats)]
+    timer = _timer(lambda: solve(setting, start.x, start.u, needed, 0.0))
+    pairs = [(timer(), 1e6 * theirs(rival_needed)[2]) for _ in range(repeats)]
     return median(pair[0] for pair in pairs), median(pair[1] for pair in pairs)
 
 
-def _our_cost(solver: DDPSolver, x: Array, u: Array, iterations: int) -> float:
-    solve(solver, x, u, iterations, 0.0)
-    return float(solver.kernel.outputs["info"][0])
+def _our_cost(setting: Setting, x: Array, u: Array, iterations: int) -> float:
+    solve(setting, x, u, iterations, 0.0)
+    return float(setting.solver.kernel.outputs["info"][0])
 
 
 def _first(cost: Callable[[int], float], goal: float, most: int = 60) -> int:
@@ -202,96 +255,11 @@ def _timer(call: Callable[[], object]) -> Callable[[], float]:
     return timed
 
 
-class Crocoddyl:
-    """crocoddyl's SolverBoxDDP of a `Problem`, through `perf_crocoddyl.cpp`."""
-
-    def __init__(self, problem: Problem) -> None:
-        self._nx, self._nu = problem.nx, problem.nu
-        with tempfile.TemporaryDirectory(prefix="safeswitch-perf-") as folder:  # a loaded library needs no file
-            self._library = ctypes.CDLL(str(compile_rival(problem, Path(folder))))
-        self._library.croco_make.restype = ctypes.c_void_p
-        lo, hi = np.array(problem.u_lo), np.array(problem.u_hi)
-        self._handle = ctypes.c_void_p(
-            self._library.croco_make(problem.nx, problem.nu, problem.np, problem.horizon, _pointer(lo), _pointer(hi))
-        )
-
-    def solve(self, x: Array, u: Array, iterations: int, stop: float) -> tuple[float, int, float]:
-        """(cost, iterations made, seconds) from the feasible trajectory x (N + 1, nx), u (N, nu)."""
-        x, u, info = x.copy(), u.copy(), np.zeros(3)
-        arguments = (_pointer(PARAMETERS), _pointer(x), _pointer(u))
-        self._library.croco_solve(self._handle, *arguments, iterations, ctypes.c_double(stop), _pointer(info))
-        return float(info[0]), int(info[1]), float(info[2])
-
-    def __del__(self) -> None:
-        if hasattr(self, "_handle"):
-            self._library.croco_free(self._handle)
-
-
-def _pointer(array: Array) -> ctypes.c_void_p:
-    return ctypes.c_void_p(array.ctypes.data)
-
-
-def compile_rival(problem: Problem, folder: Path) -> Path:
-    """Compile the C++ program with the generated C code into a library in `folder`."""
-    compiler, plain = shutil.which("g++"), find_compiler()
-    if compiler is None or plain is None:
-        raise UnavailableError("no g++ on the PATH (on Debian or Ubuntu: apt-get install -y g++)")
-    prefix = crocoddyl_prefix()
-    flags = [flag for flag in FLAGS if flag != "-shared"]
-    objects = []
-    for function in action_functions(problem):
-        c_file, built = folder / f"{function.name()}.c", folder / f"{function.name()}.o"
-        c_file.write_text(source(function))
-        _compile([plain, *flags, "-c", str(c_file), "-o", str(built)])
-        objects.append(str(built))
-    # The wheel is built for the plain architecture, and Eigen's allocator depends on it: with -march=native here,
-    # matrices would be allocated one way and freed the other. This file only passes pointers on;
-    # the arithmetic is in `objects`.
-    cpp = [compiler, "-std=c++17", "-O3", "-DNDEBUG", "-fPIC", "-shared"]
-    cpp += [f"-I{prefix / 'include'}", f"-I{prefix / 'include' / 'eigen3'}"]
-    library = folder / "libperf_crocoddyl.so"
-    program = Path(__file__).with_name("perf_crocoddyl.cpp")
-    link = [f"-L{prefix / 'lib'}", "-lcrocoddyl", f"-Wl,--disable-new-dtags,-rpath,{prefix / 'lib'}"]
-    _compile([*cpp, str(program), *objects, *link, "-o", str(library)])
-    return library
-
-
-def crocoddyl_prefix() -> Path:
-    """Where pip put crocoddyl's and Eigen's headers and libraries."""
-    try:
-        distribution = importlib.metadata.distribution("libcrocoddyl")
-    except importlib.metadata.PackageNotFoundError:
-        raise UnavailableError(f"crocoddyl is not installed ({INSTALL})") from None
-    prefix = Path(str(distribution.locate_file("cmeel.prefix")))
-    if not (prefix / "include" / "eigen3" / "Eigen" / "Core").is_file():
-        raise UnavailableError(f"Eigen's headers are not installed ({INSTALL})")
-    return prefix
-
-
-def _compile(command: list[str]) -> None:
-    answer = subprocess.run(command, capture_output=True, text=True, check=False)
-    if answer.returncode != 0:
-        raise UnavailableError(f"{command[0]} failed: {answer.stderr.strip()[-800:]}")
-
-
-def action_functions(problem: Problem) -> list[ca.Function]:
-    """What crocoddyl's action model calls: dynamics, cost, and their derivatives (Gauss-Newton Hessians)."""
-    x, u, p = ca.MX.sym("x", problem.nx), ca.MX.sym("u", problem.nu), ca.MX.sym("p", problem.np)
-    f, r, end = problem.dynamics(x, u, p), problem.residual(x, u, p), problem.terminal_residual(x, p)
-    rx, ru, end_x = ca.jacobian(r, x), ca.jacobian(r, u), ca.jacobian(end, x)
-    slopes = [ca.jacobian(f, x), ca.jacobian(f, u), rx.T @ r, ru.T @ r]
-    return [
-        expanded("perf_calc", [x, u, p], [f, 0.5 * ca.sumsqr(r)]),
-        expanded("perf_diff", [x, u, p], [*slopes, rx.T @ rx, ru.T @ ru, rx.T @ ru]),
-        expanded("perf_end_calc", [x, p], [0.5 * ca.sumsqr(end)]),
-        expanded("perf_end_diff", [x, p], [end_x.T @ end, end_x.T @ end_x]),
-    ]
-
-
 def main() -> None:
     """Print every benchmark."""
     benchmarks: dict[str, Callable[[], dict[str, Any]]] = {
         "expert": expert_benchmark,
+        "expert of the rally car": rally_car_benchmark,
         "rendering": rendering_benchmark,
         "decision": decision_benchmark,
         "handover table": handover_benchmark,

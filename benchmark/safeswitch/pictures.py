@@ -18,6 +18,7 @@ from safeswitch.handover.table import HandoverTable
 from safeswitch.protocols import Arming, Expert
 from safeswitch.scoring import episode_figures, figures
 from safeswitch.scoring.leaderboard import read_csv
+from safeswitch.scoring.metrics import OTHERS
 from safeswitch.scoring.style import Marks
 from safeswitch.scoring.video import HEIGHT, Trace, observations, replay_frames, sees_images, write_side_by_side
 from safeswitch.store import Store
@@ -53,9 +54,9 @@ def draw(folder: Path, root: str, task: Task, trained: Trained, episodes: str, t
     target = folder / "figures"
     target.mkdir(parents=True)
     loaded = tables.load(store, task, cell)
-    rows = load_frame(store.folder(episodes) / "episodes.npz")
+    rows = _own(load_frame(store.folder(episodes) / "episodes.npz"))
     logs = load_arrays(store.folder(episodes) / "logs.npz")
-    table = read_csv(store.folder(scores) / "leaderboard.csv")
+    table = _own(read_csv(store.folder(scores) / "leaderboard.csv"))
     for protocol in scoring_stages.protocols_of(cell):
         calibration = scoring_stages.calibration_of(loaded, task, cell, protocol, seed=0)
         for signal in drawn_signals(task):
@@ -69,6 +70,11 @@ def draw(folder: Path, root: str, task: Task, trained: Trained, episodes: str, t
     _draw_episode(story, rows, target)
     _draw_film(story, target)
     _draw_disturbances(task, target)
+
+
+def _own(rows: pd.DataFrame) -> pd.DataFrame:
+    """Without the rows that leave a disturbance out: figures are of one cell and its own calibration."""
+    return rows[rows["calibrated_on"] != OTHERS]
 
 
 def drawn_signals(task: Task) -> tuple[str, ...]:
@@ -279,11 +285,10 @@ def _sheet_frames(task: Task, cell: Cell, expert: Expert, seed: int) -> list[NDA
     env = stages.make_env(task, cell)
     env.reset(seed=seed)
     expert.reset()
-    wanted = [(env.onset or 0) + step for step in SHEET_STEPS]
     seen: dict[int, NDArray[np.uint8]] = {}
-    while not env.done and env.step_index <= wanted[-1]:
-        if env.step_index in wanted:
-            seen[env.step_index] = env.observe()
+    # The onset may be the first step at which something is in view, and is known only then.
+    while not env.done and env.step_index <= (env.onset or 0) + SHEET_STEPS[-1]:
+        seen[env.step_index] = env.observe()
         env.advance(expert.action(env.state, env.parameters))
     env.close()
-    return [seen.get(step) for step in wanted]
+    return [seen.get((env.onset or 0) + step) for step in SHEET_STEPS]

@@ -30,8 +30,8 @@ from safeswitch.stages import (
     only_seen,
     table_jobs,
 )
-from safeswitch.store import Store
-from safeswitch.suite import Cell, Profile, Split, Task
+from safeswitch.store import Key, Store
+from safeswitch.suite import Cell, Profile, Split, Task, others
 from safeswitch.trained import Trained, fitted_signals, needs_members, with_signals_of
 
 PAPER = ("epistemic", "aleatoric", "total")
@@ -98,10 +98,15 @@ class Run:
                 seed,
                 key,
                 fits[seed].key if fits else None,
-                tuple(other for other in keys if other != key) if members else (),
+                self._others(seed, keys) if members else (),
             )
             for seed, key in enumerate(keys)
         ]
+
+    def _others(self, seed: int, keys: list[Key]) -> tuple[Key, ...]:
+        """Keys of the learners that an ensemble asks beside this one: the next ones, if not all."""
+        following = [*keys[seed + 1 :], *keys[:seed]][: self.task.others]
+        return tuple(key for key in keys if key in following)
 
     @cached_property
     def tables(self) -> dict[tuple[int, str], CellTables]:
@@ -110,9 +115,9 @@ class Run:
 
     def tables_of(self, seed: int, cell: Cell) -> CellTables:
         """Handover tables of one (learner seed, cell), computing no other cell's."""
-        return self._tables(tuple(dict.fromkeys([self.task.calibrated_on(cell), self.task.none_cell, cell])))[
-            seed, str(cell)
-        ]
+        task = self.task
+        needed = (task.calibrated_on(cell), task.none_cell, task.undisturbed(cell), cell)
+        return self._tables(tuple(dict.fromkeys(needed)))[seed, str(cell)]
 
     @cached_property
     def task_info(self) -> TaskInfo:
@@ -121,27 +126,29 @@ class Run:
         return TaskInfo(horizon=env.horizon, control_dt=env.control_dt)
 
     def _tables(self, cells: tuple[Cell, ...]) -> dict[tuple[int, str], CellTables]:
-        none = self.task.none_cell
-        calibrated_on = {none, *(self.task.calibrated_on(cell) for cell in cells)}
+        task = self.task
+        none = tuple(dict.fromkeys(task.undisturbed(cell) for cell in cells))
+        calibrated_on = {task.none_cell, *(task.calibrated_on(cell) for cell in cells)}
         chunks: dict[tuple[int, Cell, Split], list[Job]] = {}
-        for group in ((none,), tuple(cell for cell in cells if cell != none)):  # the others share outcomes of `none`
+        for group in (none, tuple(cell for cell in cells if cell not in none)):  # the others share outcomes of `none`
             stage = []
             for trained, cell in product(self.trained, group):
                 splits: tuple[Split, ...] = ("test", "calibrate") if cell in calibrated_on else ("test",)
                 for split in splits:
-                    twins = chunks.get((trained.seed, none, split), ())
+                    twins = chunks.get((trained.seed, task.undisturbed(cell), split), ())
                     seeds = self.profile.seeds_of(split)
-                    jobs = table_jobs(self.store, self.task, cell, split, seeds, trained, twins)
+                    jobs = table_jobs(self.store, task, cell, split, seeds, trained, twins)
                     chunks[trained.seed, cell, split] = jobs
                     stage += jobs
             self.finish("handover tables", stage)
         keys = {name: tuple(job.key for job in jobs) for name, jobs in chunks.items()}
         return {
             (seed, str(cell)): CellTables(
-                keys[seed, self.task.calibrated_on(cell), "calibrate"],
-                keys[seed, none, "calibrate"],
+                keys[seed, task.calibrated_on(cell), "calibrate"],
+                keys[seed, task.undisturbed(task.calibrated_on(cell)), "calibrate"],
                 keys[seed, cell, "test"],
-                keys[seed, none, "test"],
+                keys[seed, task.undisturbed(cell), "test"],
+                tuple((other, keys[seed, other, "calibrate"]) for other in others(cell, cells)),
             )
             for seed in range(len(self.learners))
             for cell in cells
@@ -169,7 +176,6 @@ class Run:
             for cell in self.profile.cells_of(self.task)
             if cell.tag != "none"
         }
-        none = str(self.task.none_cell)
         chunks = -(-self.profile.signal_episodes // CHUNK)
         jobs = [
             signals_job(
@@ -178,7 +184,7 @@ class Run:
                 cell,
                 self.trained[seed],
                 keys,
-                tables[seed, none].test[: None if cell in self.profile.cells_of(self.task) else chunks],
+                tables[seed, str(self.task.undisturbed(cell))].test[: None if cell in self.profile.cells_of(self.task) else chunks],
             )
             for (seed, cell), keys in {**test, **further}.items()
         ]

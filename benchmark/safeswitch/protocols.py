@@ -193,8 +193,8 @@ class SwitchRule(Protocol):
     """Decides the driver of each step from the signals, and from nothing else.
 
     A class or function that makes one is enough for `--rule package.module:factory`. Three attributes are then looked
-    at, with these defaults: `signals = ()`, ids of the signals that the rule reads (besides the one that stands behind
-    `@`); `latched = True`, whether it never gives control back; `needs = ()`, as in `Method`.
+    at, with these defaults: `reads = ()`, ids of the signals that the rule looks at (in plain episodes the others are
+    not computed); `latched = True`, whether it never gives control back; `needs = ()`, as in `Method`.
     """
 
     def reset(self, seed: int) -> None:
@@ -223,7 +223,8 @@ class Calibrated:
     """A method after calibration in one (learner, cell, arming).
 
     Attributes:
-        rule: the switch rule, ready to run.
+        rule: the switch rule, ready to run; None where the method cannot have what it asks for in this cell (for
+            example a share of expert steps): it is then left out there.
         threshold: its threshold in the signal's units; NaN where it has none.
         tuning_episodes: episodes spent on calibration (candidates x episodes for searches).
         expert_queries: expert-driven steps spent on calibration.
@@ -242,8 +243,8 @@ class Method(Protocol):
     """Signal x calibrator x return rule, found by its id (`rule@signal`, or `rule` alone).
 
     `needs` lists what calibration or decision requires beyond the learner: any of "expert-queries", "failures",
-    "rollouts", "privileged". `latched` is False for a rule that may give control back. An optional `signals` lists the
-    ids of signals that it reads besides the one in its id.
+    "rollouts", "privileged". `latched` is False for a rule that may give control back. An optional `reads` lists
+    the ids of signals that it looks at besides the one in its id.
     """
 
     id: str

@@ -20,6 +20,7 @@ from safeswitch import pictures, registry
 from safeswitch.files import load_json, save_frame, save_json
 from safeswitch.scoring.comparisons import paired_comparisons
 from safeswitch.scoring.leaderboard import leaderboard, merge_task_rows, read_csv, write_csv
+from safeswitch.scoring.left_out import left_out_lines, left_out_table
 from safeswitch.scoring.markdown import write_markdown
 from safeswitch.scoring.metrics import TaskInfo
 from safeswitch.scoring.signal_quality import signal_table
@@ -33,7 +34,9 @@ if TYPE_CHECKING:
     from safeswitch.stages import CellTables
     from safeswitch.trained import Trained
 
-TABLES = ("leaderboard", "signals", "comparisons")
+TABLES = ("leaderboard", "left_out", "signals", "comparisons")
+LETTERS = {"failures": "F", "rollouts": "R", "expert-queries": "Q", "privileged": "P"}
+"""What a method needs, as it stands in leaderboard.md."""
 LIBRARIES = ("casadi", "dm-control", "gymnasium", "minari", "mujoco", "numpy", "pandas", "scipy", "torch")
 CEM_SEEDS = 10
 """Seeds with which CEM is repeated to show the spread of mu*."""
@@ -60,15 +63,25 @@ def publish(run: Run, folder: Path | None = None) -> Path:
         _write_tables(run, folder / "tables" / run.task.name)
     manifest = _manifest(run, folder, commit, time.time() - started)
     save_json(folder / "manifest.json", manifest)
+    names = dict.fromkeys(name for task in (run.task, *TASKS.values()) for name in methods(task.signals))
+    needs = {name: _letters(registry.make_method(name).needs) for name in names}
+    left_out = read_csv(folder / "left_out.csv")
     write_markdown(
         read_csv(folder / "leaderboard.csv"),
         folder / "leaderboard.md",
         {name: (task.paper_cell.disturbance, task.paper_cell.severity) for name, task in TASKS.items()},
-        privileged=[name for name in methods(run.task.signals) if "privileged" in registry.make_method(name).needs],
-        give_back=[name for name in methods(run.task.signals) if not registry.make_method(name).latched],
+        privileged=[name for name in names if "privileged" in registry.make_method(name).needs],
+        give_back=[name for name in names if not registry.make_method(name).latched],
         notes=[f"{name}: profile {entry['profile']}, commit {entry['commit']}" for name, entry in manifest.items()],
+        needs=needs,
+        first={str(task): left_out_lines(rows, needs) for task, rows in left_out.groupby("task")},
     )
     return folder
+
+
+def _letters(needs: frozenset[str]) -> str:
+    """What a method needs in letters, in the order of `LETTERS`; a dash for nothing."""
+    return " ".join(letter for name, letter in LETTERS.items() if name in needs) or "–"
 
 
 def default_folder(profile: str) -> Path:
@@ -90,6 +103,7 @@ def _score(folder: Path, root: str, task: Task, info: TaskInfo, episodes: list[J
     store, infos = Store(Path(root)), {task.name: info}
     rows = load_rows(store, episodes, "episodes.npz")
     write_csv(leaderboard(rows, infos), folder / "leaderboard.csv")
+    write_csv(left_out_table(rows, infos), folder / "left_out.csv")
     write_csv(paired_comparisons(rows, infos), folder / "comparisons.csv")
     write_csv(signal_table(load_rows(store, signals, "signals.npz")), folder / "signals.csv")
 
@@ -141,7 +155,7 @@ def _write_tables(run: Run, folder: Path) -> None:
     for job in run.episodes:
         cell, trained = job.arguments[2], job.arguments[3]
         if cell in run.task.cells[:3]:
-            target = folder / f"{cell.disturbance}-{cell.severity}-learner{trained.seed}.npz"
+            target = folder / f"{cell.label}-{cell.severity}-learner{trained.seed}.npz"
             shutil.copyfile(run.store.folder(job.key) / "test.npz", target)
 
 

@@ -119,7 +119,7 @@ class ReadyRule:
 
     Attributes:
         id: as on the command line.
-        rule: the rule, which may say `latched`, `needs` and `signals` as a method does.
+        rule: the rule, which may say `latched`, `needs` and `reads` as a method does.
     """
 
     id: str
@@ -136,9 +136,9 @@ class ReadyRule:
         return bool(getattr(self.rule, "latched", True))
 
     @property
-    def signals(self) -> tuple[str, ...]:
-        """Ids of the signals that the rule reads."""
-        return tuple(getattr(self.rule, "signals", ()))
+    def reads(self) -> tuple[str, ...]:
+        """Ids of the signals that the rule looks at."""
+        return tuple(getattr(self.rule, "reads", ()))
 
     def calibrate(self, calibration: Calibration) -> Calibrated:
         """The rule as it is."""

@@ -9,6 +9,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pandas as pd
 
 from safeswitch import registry
@@ -18,6 +19,7 @@ from safeswitch.handover.panel import Calibration, Panel
 from safeswitch.handover.shown import shown_traces
 from safeswitch.handover.table import HandoverTable, concatenate
 from safeswitch.protocols import ARMINGS, Arming
+from safeswitch.scoring.metrics import OTHERS
 from safeswitch.scoring.rows import episode_rows, latched_rows
 from safeswitch.scoring.signal_quality import SignalQuality, frame_quality, signal_quality
 from safeswitch.stages import CellTables, Job, concat, load_table, make_env, only_seen, recorded_table, source_of
@@ -36,10 +38,9 @@ def episodes_job(store: Store, task: Task, cell: Cell, trained: Trained, tables:
     """Calibrate every method and score it on the test episodes of one (learner, cell), under both armings."""
     ids = methods(task.signals)
     settings = {"cell": str(cell), "learner_seed": trained.seed, "methods": list(ids), "give_back": give_back}
-    keys = [*tables.calibrate, *tables.calibrate_nominal, *tables.test, *tables.test_nominal]
     rules = {source_of("method", name.partition("@")[0]) for name in ids}
     code = ["safeswitch.handover.panel", "safeswitch.scoring.rows", *sorted(rules)]
-    key = store.key("episodes", settings, [*trained.keys, *keys], code)
+    key = store.key("episodes", settings, [*trained.keys, *tables.keys], code)
     arguments = (str(store.root), task, cell, trained, tables, give_back)
     return Job("episodes", f"{cell} learner {trained.seed}", key, _score_episodes, arguments)
 
@@ -54,25 +55,47 @@ def _score_episodes(
     give_back: bool,
 ) -> None:
     loaded = tables.load(Store(Path(root)), task, cell)
+    others = tables.load_others(Store(Path(root)))
+    own = "" if task.calibrated_on(cell) == cell else str(task.calibrated_on(cell))
     frames, logs = [], {}
     for protocol in protocols_of(cell):
         test = test_panel(loaded, cell, protocol)
         calibration = calibration_of(loaded, task, cell, protocol, trained.seed)
         for method_id in methods(task.signals):
             method: Method = registry.make_method(method_id)
-            if not method.latched and not give_back:
+            if not method.latched and not (give_back and protocol == "start"):
                 continue
             calibrated = method.calibrate(calibration)
+            if calibrated.rule is None:
+                continue
             if method.latched:
                 rows = latched_rows(test, calibrated)
             else:
-                rows = plain_rows(task, cell, trained, test, calibrated.rule)
-            on = "" if task.calibrated_on(cell) == cell else str(task.calibrated_on(cell))
-            frames.append(labelled(rows, cell, protocol, method_id, trained.seed, calibrated, on))
+                rows = plain_rows(task, cell, trained, test, method, calibrated.rule)
+            frames.append(labelled(rows, cell, protocol, method_id, trained.seed, calibrated, own))
             logs.update({f"{protocol}|{method_id}|{name}": value for name, value in calibrated.log.items()})
+        if others is not None:
+            nominal = loaded["calibrate_nominal"]
+            twins = nominal.take(np.tile(np.arange(len(nominal)), len(others) // len(nominal)))
+            left_out = Calibration(_panel(others, twins, cell, protocol), nominal, seed=trained.seed)
+            frames += _left_out_rows(task, cell, trained, test, left_out)
     save_frame(folder / "episodes.npz", concat(frames))
     save_arrays(folder / "logs.npz", **logs)
     loaded["test"].save(folder / "test.npz", snapshots=False)
+
+
+def _left_out_rows(
+    task: Task, cell: Cell, trained: Trained, test: Panel, calibration: Calibration
+) -> list[pd.DataFrame]:
+    """Rows of the latched methods that learn from disturbed episodes, calibrated on those of other disturbances."""
+    frames = []
+    for method in map(registry.make_method, methods(task.signals)):
+        learns = method.needs & {"failures", "rollouts"} and "privileged" not in method.needs
+        calibrated = method.calibrate(calibration) if learns and method.latched else None
+        if calibrated is not None and calibrated.rule is not None:
+            rows = latched_rows(test, calibrated)
+            frames.append(labelled(rows, cell, test.arming, method.id, trained.seed, calibrated, OTHERS))
+    return frames
 
 
 def protocols_of(cell: Cell) -> tuple[Arming, ...]:
@@ -100,14 +123,15 @@ def _panel(table: HandoverTable, nominal: HandoverTable, cell: Cell, protocol: A
     return Panel(concatenate([table, nominal]) if protocol == "start" else table, protocol)
 
 
-def plain_rows(task: Task, cell: Cell, trained: Trained, test: Panel, rule: Any) -> pd.DataFrame:
+def plain_rows(task: Task, cell: Cell, trained: Trained, test: Panel, method: Method, rule: Any) -> pd.DataFrame:
     """Rules that give control back have no table: drive the same episodes."""
-    driver, signals = trained.learner(task), trained.signals(task)
-    envs = {True: make_env(task, cell), False: make_env(task, task.none_cell)}
+    driver, signals = trained.learner(task), trained.signals(task, getattr(rule, "reads", None))
+    envs = {True: make_env(task, cell), False: make_env(task, task.undisturbed(cell))}
     experts = {kind: env.make_expert() for kind, env in envs.items()}
+    advisers = {kind: env.make_expert() if "expert-queries" in method.needs else None for kind, env in envs.items()}
     episodes = [
-        run_episode(envs[bool(kind)], driver, signals, rule, experts[bool(kind)], int(seed), test.arming)
-        for seed, kind in zip(test.table.seeds, test.table.disturbed, strict=True)
+        run_episode(envs[kind], driver, signals, rule, experts[kind], seed, test.arming, adviser=advisers[kind])
+        for seed, kind in zip(test.table.seeds.tolist(), test.table.disturbed.tolist(), strict=True)
     ]
     for env in envs.values():
         env.close()
@@ -120,7 +144,7 @@ def labelled(
     """Rows of `scoring.rows` with the columns that say what they are rows of."""
     return rows.assign(
         task=cell.task,
-        disturbance=cell.disturbance,
+        disturbance=cell.label,
         severity=cell.severity,
         protocol=protocol,
         method=method_id,
@@ -180,6 +204,6 @@ def _score_signals(
             by_signal[signal] = replace(frames, episode_auroc=before.episode_auroc)
     rows = [{"signal": signal, **asdict(quality)} for signal, quality in by_signal.items()]
     frame = pd.DataFrame(rows).assign(
-        task=cell.task, disturbance=cell.disturbance, severity=cell.severity, learner=trained.seed
+        task=cell.task, disturbance=cell.label, severity=cell.severity, learner=trained.seed
     )
     save_frame(folder / "signals.npz", frame)

@@ -17,7 +17,7 @@ import pandas as pd
 
 from safeswitch import demos, factories, registry
 from safeswitch.files import load_frame, save_arrays
-from safeswitch.handover.table import HandoverTable, join_chunks, record_table
+from safeswitch.handover.table import HandoverTable, concatenate, join_chunks, record_table
 from safeswitch.protocols import TrainingFeatures
 from safeswitch.store import Key, Store
 from safeswitch.suite import Cell, Profile, Split, Task, episode_seeds
@@ -169,11 +169,11 @@ def table_jobs(
             "split": split,
             "seeds": chunk,
             "signals": list(task.signals),
-            "complete": cell.complete,
+            "complete": cell.complete(split),
         }
         key = store.key("table", settings, [*trained.keys, *twin], code)
         label = f"{cell} {split} {first}-{first + len(chunk) - 1} (learner {trained.seed})"
-        arguments = (task, cell, chunk, trained, [str(store.folder(key)) for key in twin])
+        arguments = (task, cell, split, chunk, trained, [str(store.folder(key)) for key in twin])
         jobs.append(Job("table", label, key, _tabulate, arguments))
     return jobs
 
@@ -182,6 +182,7 @@ def _tabulate(
     folder: Path,
     task: Task,
     cell: Cell,
+    split: Split,
     seeds: Sequence[int],
     trained: Trained,
     twins: Sequence[str],
@@ -190,7 +191,7 @@ def _tabulate(
     table = record_table(env, trained.learner(task), trained.signals(task), env.make_expert(), seeds)
     for twin in twins:
         table.share(HandoverTable.load(Path(twin) / "table.npz"))
-    if cell.complete:
+    if cell.complete(split):
         table.complete()
     table.save(folder / "table.npz")
     env.close()
@@ -209,17 +210,37 @@ def load_table(store: Store, task: Task, cell: Cell, keys: tuple[str, ...]) -> H
 
 @dataclass(frozen=True)
 class CellTables:
-    """Keys of the table chunks that one (learner, cell) is calibrated and tested on."""
+    """Keys of the table chunks that one (learner, cell) is calibrated and tested on.
+
+    `others` has the calibrate chunks of the cells of every other disturbance, for the rows that leave this one out.
+    """
 
     calibrate: tuple[str, ...]
     calibrate_nominal: tuple[str, ...]
     test: tuple[str, ...]
     test_nominal: tuple[str, ...]
+    others: tuple[tuple[Cell, tuple[str, ...]], ...] = ()
+
+    @property
+    def keys(self) -> list[str]:
+        """Keys of every chunk, in order."""
+        others = [key for _, keys in self.others for key in keys]
+        return [*self.calibrate, *self.calibrate_nominal, *self.test, *self.test_nominal, *others]
+
+    def load_others(self, store: Store) -> HandoverTable | None:
+        """The calibrate episodes of every other disturbance; None without."""
+        tables = [recorded_table(store, keys) for _, keys in self.others]  # complete: they need no simulator
+        return concatenate(tables) if tables else None
 
     def load(self, store: Store, task: Task, cell: Cell) -> dict[str, HandoverTable]:
         """Each table by the name of its attribute; tables of the same episodes are one object."""
         on = task.calibrated_on(cell)
-        cells = {"calibrate": on, "calibrate_nominal": task.none_cell, "test": cell, "test_nominal": task.none_cell}
+        cells = {
+            "calibrate": on,
+            "calibrate_nominal": task.undisturbed(on),
+            "test": cell,
+            "test_nominal": task.undisturbed(cell),
+        }
         by_keys: dict[tuple[str, ...], HandoverTable] = {}
         for name, its_cell in cells.items():
             keys = getattr(self, name)
@@ -230,7 +251,7 @@ class CellTables:
 
 def only_seen(cell: Cell) -> bool:
     """Whether the disturbance changes nothing but the picture: the same state can then be seen without it."""
-    from safeswitch.tasks import visual  # noqa: F401  (registers the disturbances of images)
+    from safeswitch.tasks import rally_disturbances, rally_visual, visual  # noqa: F401  (register disturbances)
     from safeswitch.tasks.disturbances import DISTURBANCES  # imports mujoco
 
     return cell.tag != "none" and DISTURBANCES[cell.disturbance].only_seen

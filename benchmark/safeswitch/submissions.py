@@ -115,7 +115,7 @@ def write(found: Evaluation, folder: Path, name: str, authors: str, url: str = "
         },
         "cell": {
             "task": cell.task,
-            "disturbance": cell.disturbance,
+            "disturbance": cell.label,
             "severity": cell.severity,
             "protocol": found.protocol,
         },

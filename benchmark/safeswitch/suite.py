@@ -35,26 +35,45 @@ def episode_seeds(split: Split, count: int, first: int = 0) -> list[int]:
 class Cell:
     """One (task, disturbance, severity). Severity is 0 for `none`.
 
-    A `held-out` cell is the paper's disturbance with kinds of it that no calibration shows.
+    A `held-out` cell is the paper's disturbance as no calibration shows it: other kinds of it, or on another track.
+
+    Attributes:
+        task: name of the task.
+        disturbance: name of the disturbance, or "none".
+        severity: 1 to 5, 0 for "none".
+        tag: what the cell is for.
+        track: where the task is driven, if not where the learner was trained.
     """
 
     task: str
     disturbance: str
     severity: int
     tag: Tag
+    track: str = ""
 
     def __str__(self) -> str:
-        return f"{self.task}/{self.disturbance}" + (f"-{self.severity}" if self.severity else "")
+        return f"{self.task}/{self.label}" + (f"-{self.severity}" if self.severity else "")
 
     @property
-    def complete(self) -> bool:
-        """Whether every outcome is computed in advance: cells that many rules, and published tables, come back to."""
-        return self.tag == "none" or (self.tag == "paper" and self.severity == 3)
+    def label(self) -> str:
+        """Name of the disturbance as it stands in tables, with the track where that is another one."""
+        return f"{self.disturbance}@{self.track}" if self.track else self.disturbance
+
+    @property
+    def left_out(self) -> bool:
+        """Whether thresholds are also calibrated on the other disturbances: severity 3 of what does harm."""
+        return self.severity == 3 and self.tag in ("paper", "other")
+
+    def complete(self, split: Split) -> bool:
+        """Whether every outcome is computed in advance: tables that many rules, and cells, come back to."""
+        often = self.left_out and split == "calibrate"
+        return self.tag == "none" or (self.tag == "paper" and self.severity == 3) or often
 
     @property
     def env_kwargs(self) -> dict[str, Any]:
         """Keyword arguments of `gymnasium.make`."""
-        return {} if self.tag == "none" else {"disturbance": self.disturbance, "severity": self.severity}
+        track = {"track": self.track} if self.track else {}
+        return track if self.tag == "none" else {"disturbance": self.disturbance, "severity": self.severity, **track}
 
 
 @dataclass(frozen=True)
@@ -75,6 +94,7 @@ class Task:
         showcase: signals that the figures show besides the paper's.
         literal: the learner as the paper describes it, where it is not the one above; it is reported beside it.
         literal_options: overrides of its configuration.
+        others: most learners of other seeds that an ensemble asks beside its own; None for all of them.
     """
 
     name: str
@@ -90,6 +110,7 @@ class Task:
     showcase: tuple[str, ...] = ()
     literal: str = ""
     literal_options: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    others: int | None = None
 
     @property
     def paper_cell(self) -> Cell:
@@ -101,9 +122,13 @@ class Task:
         """The undisturbed cell."""
         return next(cell for cell in self.cells if cell.tag == "none")
 
+    def undisturbed(self, cell: Cell) -> Cell:
+        """The cell of the undisturbed twins of a cell's episodes."""
+        return next(each for each in self.cells if each.tag == "none" and each.track == cell.track)
+
     def severities(self, *severities: int) -> tuple[Cell, ...]:
         """Cells of every disturbance at further severities, those that the task has already left out."""
-        disturbed = {cell.disturbance: cell.tag for cell in self.cells if cell.tag != "none"}
+        disturbed = {cell.disturbance: cell.tag for cell in self.cells if cell.tag != "none" and not cell.track}
         every = (Cell(self.name, name, severity, tag) for name, tag in disturbed.items() for severity in severities)
         return tuple(cell for cell in every if cell not in self.cells)
 
@@ -118,6 +143,14 @@ class Task:
         paper's cell.
         """
         return self.paper_cell if cell.tag in ("none", "benign", "held-out") else cell
+
+
+def others(cell: Cell, cells: tuple[Cell, ...]) -> tuple[Cell, ...]:
+    """Those of `cells` that thresholds come from when the disturbance of `cell` is left out; none for cells that have
+    no such rows.
+    """
+    found = tuple(each for each in cells if each.left_out and each.disturbance != cell.disturbance)
+    return found if cell.left_out else ()
 
 
 def _cart_pole_cells() -> tuple[Cell, ...]:
@@ -144,6 +177,22 @@ VGG: Mapping[str, Any] = {
 batches drawn from all of them (1 GB in memory) better than from a hundred at a time."""
 
 
+RALLY_LEARNER: Mapping[str, Any] = {
+    "frames": 1,
+    "differences": False,
+    "feature_dropout": 0.2,
+    "hidden_dropout": (0.3, 0.0),
+    "components": 64,
+    "excess_gain": 40.0,
+    "warmup_epochs": 2,
+    "epochs": 6,
+    "batch_size": 32,
+    "learning_rate": 2e-3,
+    "pool_episodes": 1000,
+}
+"""One frame shows what the expert steers by: where the car is on the track, how it stands, how the track bends."""
+
+
 def _cart_pole_image_cells() -> tuple[Cell, ...]:
     name = "cart-pole-image"
     others = ("object-passing", "occlusion", "lighting", "camera-shift", "pixel-noise", "background", "cart-mass")
@@ -153,6 +202,21 @@ def _cart_pole_image_cells() -> tuple[Cell, ...]:
         Cell(name, "object-far", 3, "benign"),
         *(Cell(name, "object", severity, "paper") for severity in (1, 2, 4, 5)),
         Cell(name, "object-held-out", 3, "held-out"),
+        *(Cell(name, other, 3, "other") for other in others),
+    )
+
+
+def _rally_car_image_cells() -> tuple[Cell, ...]:
+    name, others = "rally-car-image", ("mud", "dusk", "camera-dirt", "camera-pitch", "steering-bias")
+    return (
+        Cell(name, "obstacle", 3, "paper"),
+        Cell(name, "none", 0, "none"),
+        Cell(name, "roadside", 3, "benign"),
+        *(Cell(name, "obstacle", severity, "paper") for severity in (1, 2, 4, 5)),
+        Cell(name, "obstacle-held-out", 3, "held-out"),
+        Cell(name, "obstacle", 3, "held-out", track="hollow"),
+        Cell(name, "none", 0, "none", track="hollow"),
+        Cell(name, "puddle-paint", 3, "benign"),
         *(Cell(name, other, 3, "other") for other in others),
     )
 
@@ -168,7 +232,17 @@ TASKS: dict[str, Task] = {
             "noise": {"low": 0.23, "high": 0.23, "correlated_fraction": 1.0, "correlation": 0.5},
         },
         dataset="safeswitch/cart-pole/expert-v0",
-        signals=("epistemic", "aleatoric", "total", "total-mean3", "total-mean5", "epistemic-mean3", "epistemic-mean5"),
+        signals=(
+            "epistemic",
+            "aleatoric",
+            "total",
+            "total-mean3",
+            "total-mean5",
+            "epistemic-mean3",
+            "epistemic-mean5",
+            "mahalanobis",
+            "discrepancy",
+        ),
         cells=_cart_pole_cells(),
         modules=("safeswitch.tasks.cart_pole", "safeswitch.expert.cart_pole_model"),
         assets=("cart_pole", "common"),
@@ -194,6 +268,7 @@ TASKS: dict[str, Task] = {
             "mahalanobis",
             "mahalanobis-mean3",
             "rnd",
+            "discrepancy",
         ),
         cells=_cart_pole_image_cells(),
         modules=(
@@ -207,6 +282,47 @@ TASKS: dict[str, Task] = {
         showcase=("ensemble-mean3", "mahalanobis"),
         literal="paper-literal",
         literal_options=VGG,
+    ),
+    "rally-car-image": Task(
+        name="rally-car-image",
+        env_id="SafeSwitch/RallyCarImage-v0",
+        learner="dropout-vgg",
+        learner_options=RALLY_LEARNER,
+        demonstrations={
+            "episodes": 120,
+            "noise": {"low": 0.05, "high": 0.3, "correlated_fraction": 0.5, "correlation": 0.8},
+        },
+        dataset="safeswitch/rally-car-image/expert-v0",
+        signals=(
+            "epistemic",
+            "aleatoric",
+            "total",
+            "total-mean3",
+            "epistemic-mean3",
+            "ensemble",
+            "ensemble-mean3",
+            "mahalanobis",
+            "rnd",
+            "discrepancy",
+        ),
+        cells=_rally_car_image_cells(),
+        modules=(
+            "safeswitch.tasks.car_geometry",
+            "safeswitch.tasks.course",
+            "safeswitch.tasks.placing",
+            "safeswitch.tasks.rally_car",
+            "safeswitch.tasks.rally_car_config",
+            "safeswitch.tasks.rally_car_image",
+            "safeswitch.tasks.rally_disturbances",
+            "safeswitch.tasks.rendering",
+            "safeswitch.tasks.sight",
+            "safeswitch.tasks.track",
+            "safeswitch.expert.bicycle",
+            "safeswitch.expert.rally_car_model",
+        ),
+        assets=("rally_car", "common"),
+        showcase=("ensemble-mean3", "mahalanobis"),
+        others=2,
     ),
 }
 
@@ -233,17 +349,28 @@ def _methods(signals: tuple[str, ...], rules: tuple[str, ...]) -> tuple[str, ...
     return tuple(f"{rule}@{signal}" for signal in signals for rule in rules)
 
 
-BOUNDS = ("learner", "expert", "oracle-onset", "oracle-hindsight", "timer")
-CONTROLS = ("random", "periodic", "shuffled@total")
+SHARES = (5, 10, 20, 40)
+"""Shares of expert steps at which all signals are compared [%]."""
+BOUNDS = ("learner", "expert", "oracle-onset", "oracle-hindsight", "simplex", "timer")
+CONTROLS = ("random", "periodic", "shuffled@total", *(f"random-{share}" for share in SHARES))
 QUANTILES = ("fixed-q95", "fixed-q99", "fixed-q999", "fixed-epmax95")
 VALUES = ("fixed-0.05@total", "fixed-0.1@total", "fixed-0.2@total", "fixed-0.4@total")
 CEM_VARIANTS = ("cem-literal@total", "cem-single@total", "cem-high@total", "cem-low@total")
-PER_SIGNAL = ("cem", "grid", "random-search", *QUANTILES, "best")
+MONITORS = ("conformal", "conformal-band", "patience")
+MATCHED = tuple(f"share-{share}" for share in SHARES)
+PER_SIGNAL = ("cem", "grid", "random-search", *QUANTILES, *MONITORS, *MATCHED, "best")
+OURS = ("cem-vector", "cem-vector-return")
+GIVE_BACK = ("cem-two@total", "cem-two@epistemic", "safe-dagger@discrepancy", "lazy@discrepancy")
+DOUBTS = ("epistemic", "ensemble")
+"""Signals that are a doubt in the sense of EnsembleDAgger and a novelty in that of ThriftyDAgger."""
 
 
 def methods(signals: tuple[str, ...]) -> tuple[str, ...]:
     """Every method of the comparison on these signals."""
-    return (*BOUNDS, *CONTROLS, *VALUES, *CEM_VARIANTS, *_methods(signals, PER_SIGNAL))
+    doubts = tuple(signal for signal in DOUBTS if signal in signals)
+    give_back = [method for method in GIVE_BACK if method.partition("@")[2] in signals]
+    give_back += _methods(doubts, ("ensemble-dagger", "thrifty"))
+    return (*BOUNDS, *CONTROLS, *VALUES, *CEM_VARIANTS, *OURS, *_methods(signals, PER_SIGNAL), *give_back)
 
 
 @dataclass(frozen=True)

@@ -31,14 +31,17 @@ class FrameStack:
     Args:
         encoding: of a stack.
         frames: F.
+        gain: factor of the excess.
     """
 
-    def __init__(self, encoding: PixelEncoding, frames: int) -> None:
+    def __init__(self, encoding: PixelEncoding, frames: int, gain: float = 1.0) -> None:
         height, width, self._depth = encoding.observation_shape
         self._differences = encoding.change is not None
         self._scale, self._offset = encoding.factors(frames)
+        self._excess = encoding.excess(gain)
         self._frames = np.zeros((height, width, frames * self._depth), np.float32)
-        self._encoded = np.zeros((1, *self._frames.shape), np.float32)
+        channels = (frames + (self._excess is not None)) * self._depth
+        self._encoded = np.zeros((1, height, width, channels), np.float32)
         self._tensor = torch.from_numpy(self._encoded).permute(0, 3, 1, 2)
         self.reset()
 
@@ -48,7 +51,8 @@ class FrameStack:
 
     def push(self, frame: NDArray[np.uint8]) -> torch.Tensor:
         """Take the next frame (H, W, C) in; the encoded stack (1, F C, H, W), valid until the next call."""
-        depth, frames, encoded = self._depth, self._frames, self._encoded[0]
+        depth, frames = self._depth, self._frames
+        encoded = self._encoded[0, ..., : frames.shape[-1]]
         if self._empty:
             frames[...] = np.tile(frame, frames.shape[-1] // depth)
             self._empty = False
@@ -60,6 +64,9 @@ class FrameStack:
             encoded[..., :-depth] = frames[..., depth:] - frames[..., :-depth]
         np.multiply(encoded, self._scale, out=encoded)
         np.add(encoded, self._offset, out=encoded)
+        if self._excess is not None:
+            newest = torch.from_numpy(np.ascontiguousarray(encoded[None, ..., -depth:]))
+            self._encoded[..., -depth:] = self._excess(newest).numpy()
         return self._tensor
 
 
@@ -72,7 +79,7 @@ class DropoutVGGLearner(TrainedLearner[DropoutVGG, PixelEncoding, VGGConfig]):
         """Build what `predict` needs from the model."""
         config = self.config
         height, width, _ = self.encoding.observation_shape
-        self._stack = FrameStack(self.encoding, config.frames)
+        self._stack = FrameStack(self.encoding, config.frames, config.excess_gain)
         self._head = FrozenLayers(self.model.linears(), config.head_rates, config.samples, config.shared_trunk)
         self._masks = MaskStream(config.layout(height, width), config.samples)
 

@@ -86,21 +86,28 @@ class Encoder:
         frames: F.
         rows: largest batch.
         device: where the stacks go.
+        gain: factor of the excess.
     """
 
-    def __init__(self, encoding: PixelEncoding, frames: int, rows: int, device: torch.device) -> None:
+    def __init__(
+        self, encoding: PixelEncoding, frames: int, rows: int, device: torch.device, gain: float = 1.0
+    ) -> None:
         height, width, depth = encoding.observation_shape
         self._scale, self._offset = (torch.from_numpy(value).to(device) for value in encoding.factors(frames))
         self._differences = encoding.change is not None
         self._frames = torch.empty(rows, frames * depth, height, width, dtype=torch.uint8)
         self._pixels = torch.empty(rows, height, width, frames * depth, dtype=torch.uint8)
-        self._encoded = torch.empty(rows, height, width, frames * depth, device=device)
+        self._excess = encoding.excess(gain, device)
+        self._images = frames * depth
+        channels = self._images + (self._excess is not None) * depth
+        self._encoded = torch.empty(rows, height, width, channels, device=device)
         self._depth = depth
         self.device = device
 
     def __call__(self, pool: Pool, rows: Tensor) -> Tensor:
         """Stacks of these rows, valid until the next call."""
-        frames, pixels, encoded = (each[: len(rows)] for each in (self._frames, self._pixels, self._encoded))
+        frames, pixels, whole = (each[: len(rows)] for each in (self._frames, self._pixels, self._encoded))
+        encoded = whole[..., : self._images]
         each_frame = frames.view(-1, self._depth, *frames.shape[2:])
         torch.index_select(pool.frames, 0, pool.stacks[rows].flatten(), out=each_frame)
         pixels.copy_(frames.permute(0, 2, 3, 1))  # while they are bytes: a quarter of the memory to go through
@@ -108,7 +115,9 @@ class Encoder:
         if self._differences:
             encoded[..., : -self._depth] = encoded[..., self._depth :] - encoded[..., : -self._depth]
         torch.addcmul(self._offset, encoded, self._scale, out=encoded)
-        return encoded.permute(0, 3, 1, 2)
+        if self._excess is not None:
+            whole[..., self._images :] = self._excess(encoded[..., -self._depth :])
+        return whole.permute(0, 3, 1, 2)
 
 
 def train_dropout_vgg(
@@ -144,7 +153,11 @@ def train_dropout_vgg(
     config.block_shapes(*shape[:2])
     place = device_of(device)
     with one_thread():
-        encoding = PixelEncoding.fit((demos.episode(int(index)) for index in training), config)
+
+        def images() -> Iterator[NDArray[np.uint8]]:
+            return (demos.episode(int(index)) for index in training)
+
+        encoding = PixelEncoding.fit(images(), config).with_subspace(images, config)
         model = DropoutVGG(shape, labels.shape[1], config, generator(seed, "weights")).to(place)
         history = fit(model, encoding, demos, training, held_out, seed, config, progress)
     return model, encoding, history
@@ -162,7 +175,7 @@ def fit(
 ) -> History:
     """Train `model` in place on the episodes `training`; `held_out` are for validation and may be empty."""
     place = next(model.parameters()).device
-    encoders = [Encoder(encoding, config.frames, max(config.batch_size, EVALUATION_BATCH), place) for _ in range(2)]
+    encoders = [Encoder(encoding, config.frames, max(config.batch_size, EVALUATION_BATCH), place, config.excess_gain) for _ in range(2)]
     layout = config.layout(*encoding.observation_shape[:2])
     bits = np.random.PCG64DXSM(seed_sequence(seed, "training-masks"))
     optimiser = make_optimiser(model, config)
@@ -252,7 +265,8 @@ def evaluate(model: DropoutVGG, encoder: Encoder, pool: Pool) -> tuple[float, fl
 
 def trunk_features(model: DropoutVGG, encoding: PixelEncoding, demos: Demonstrations) -> NDArray[np.float32]:
     """Features (n, d) of every step, an episode at a time, without dropout."""
-    encoder = Encoder(encoding, model.config.frames, EVALUATION_BATCH, next(model.parameters()).device)
+    place, gain = next(model.parameters()).device, model.config.excess_gain
+    encoder = Encoder(encoding, model.config.frames, EVALUATION_BATCH, place, gain)
     features = []
     with one_thread(), torch.inference_mode():
         for episode in np.unique(demos.episodes):

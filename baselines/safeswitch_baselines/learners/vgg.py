@@ -11,8 +11,8 @@ uncertainty see it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -25,7 +25,10 @@ from safeswitch.names import unknown
 from safeswitch_baselines.learners.config import TrainingConfig, factors_of, rates_of, require
 from safeswitch_baselines.learners.dropout import MaskLayout
 from safeswitch_baselines.learners.gaussian import bounded_log_var
+from safeswitch_baselines.learners.manifold import Excess, Subspace, halved
 
+REACH_FLOOR = 0.05
+"""Smallest reach of the training images off their subspace, in units of a standardised pixel."""
 STANDARDISATIONS = ("per-pixel", "centred", "none")
 
 
@@ -53,6 +56,9 @@ class VGGConfig(TrainingConfig):
         pixel_floor: added to the deviation, so that constant pixels are divided by this.
         differences: whether the older frames enter as differences of neighbouring frames, in units of their own size:
             what moves then need not be found as a small difference of large numbers.
+        components: k, principal components of the training images. What is off them in the newest frame, beyond what is
+            seen in training, enters as further channels; 0 for none. See `manifold`.
+        excess_gain: factor of these channels.
         pool_episodes: episodes held in memory at a time, as uint8; all of them stay there if they are no more.
     """
 
@@ -68,6 +74,8 @@ class VGGConfig(TrainingConfig):
     standardisation: str = "per-pixel"
     pixel_floor: float = 0.03
     differences: bool = True
+    components: int = 0
+    excess_gain: float = 4.0
     pool_episodes: int = 100
     loss: str = "beta-nll"
     warmup_epochs: int = 3
@@ -86,7 +94,9 @@ class VGGConfig(TrainingConfig):
         rates_of("hidden_dropout", self.hidden_dropout, len(self.hidden))
         if self.standardisation not in STANDARDISATIONS:
             raise unknown("standardisation", self.standardisation, STANDARDISATIONS)
-        require(self.pixel_floor > 0, "pixel_floor", self.pixel_floor, "a positive number")
+        for name in ("pixel_floor", "excess_gain"):
+            require(getattr(self, name) > 0, name, getattr(self, name), "a positive number")
+        require(self.components >= 0, "components", self.components, "0 or a number of principal components")
         for channels in self.channels:
             fits = self.branches >= 1 and channels % self.branches == 0
             require(fits, "branches", self.branches, "a common divisor of channels")
@@ -113,6 +123,10 @@ class VGGConfig(TrainingConfig):
     def shared_trunk(self) -> bool:
         """Whether all samples of a decision share one pass through the trunk."""
         return not any(self.trunk_rates)
+
+    def depth(self, channels: int) -> int:
+        """Channels of the network's input for frames of so many channels."""
+        return (self.frames + (self.components > 0)) * channels
 
     def factors(self) -> list[tuple[int, int]]:
         """(stride, pool) of every block."""
@@ -151,11 +165,15 @@ class PixelEncoding:
         scale: (H, W, C), float32.
         offset: (H, W, C), float32.
         change: (H, W, C), float32; None where frames enter as they are.
+        components: (k, d), float32, principal components of standardised frames; None where there are none.
+        reach: (d,), float32, what is hardly ever left of a training frame without them.
     """
 
     scale: NDArray[np.float32]
     offset: NDArray[np.float32]
     change: NDArray[np.float32] | None = None
+    components: NDArray[np.float32] | None = None
+    reach: NDArray[np.float32] | None = None
 
     @classmethod
     def fit(cls, episodes: Iterable[NDArray[np.uint8]], config: VGGConfig) -> PixelEncoding:
@@ -186,9 +204,29 @@ class PixelEncoding:
         return self.scale.shape
 
     def arrays(self) -> dict[str, NDArray[np.float32]]:
-        """Scale and offset, and change where it is used."""
-        parts = {"scale": self.scale, "offset": self.offset, "change": self.change}
+        """Scale and offset, and what else is used."""
+        names = ("scale", "offset", "change", "components", "reach")
+        parts = {name: getattr(self, name) for name in names}
         return {name: value for name, value in parts.items() if value is not None}
+
+    def with_subspace(self, read: Callable[[], Iterable[NDArray[np.uint8]]], config: VGGConfig) -> PixelEncoding:
+        """The same with the principal components of the training images; `read` begins to go through them again."""
+        if not config.components:
+            return self
+        scale, offset = torch.from_numpy(self.scale), torch.from_numpy(self.offset)
+
+        def standardised() -> Iterator[Tensor]:
+            for frames in read():
+                yield halved(torch.addcmul(offset, torch.from_numpy(frames).float(), scale))
+
+        subspace = Subspace.fit(standardised, config.components, REACH_FLOOR)
+        return replace(self, components=subspace.components, reach=subspace.reach)
+
+    def excess(self, gain: float, device: torch.device | str = "cpu") -> Excess | None:
+        """What computes the excess of standardised frames; None where there is none."""
+        if self.components is None or self.reach is None:
+            return None
+        return Excess(Subspace(self.components, self.reach), gain, device)
 
     def factors(self, frames: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Scale and offset (H, W, F C) of a whole stack, oldest first, after differences were taken."""
@@ -222,7 +260,7 @@ class DropoutVGG(nn.Module):
         height, width, depth = shape
         self.shapes = config.block_shapes(height, width)
         self.pools = [pool for _, pool in config.factors()]
-        inputs = (config.frames * depth, *config.channels)
+        inputs = (config.depth(depth), *config.channels)
         # `skip_init`: a plain layer would draw its weights from the global generator.
         self.blocks = nn.ModuleList(
             nn.utils.skip_init(nn.Conv2d, a, b, 3, padding=1, stride=stride, groups=config.branches if block else 1)

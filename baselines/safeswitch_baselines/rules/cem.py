@@ -76,7 +76,7 @@ def learn_threshold(panel: Panel, signal: str, settings: CEMSettings, seed: int,
         (iterations, candidates), and `mu`, `sigma` (log units unless `linear`), `reward_sum`, `accepted` per iteration.
     """
     rng = stream(seed, "cem", signal, panel.arming)
-    episodes = _EpisodeSampler(panel, settings.episodes, rng)
+    episodes = EpisodeSampler(panel, settings.episodes, rng)
     mu = settings.mu if settings.linear else float(np.log(settings.mu))
     sigma = settings.sigma * (settings.mu if settings.linear else 1.0)
     floor = settings.floor * (settings.mu if settings.linear else 1.0)
@@ -105,7 +105,7 @@ def learn_threshold(panel: Panel, signal: str, settings: CEMSettings, seed: int,
     return Calibrated(ThresholdRule(signal, threshold), threshold, cost, queries, log)
 
 
-class _EpisodeSampler:
+class EpisodeSampler:
     """Draws the episodes of an iteration without replacement until all were used; under `start` half are disturbed."""
 
     def __init__(self, panel: Panel, count: int, rng: np.random.Generator):
@@ -117,6 +117,7 @@ class _EpisodeSampler:
         self.share = max(count // len(self.groups), 1)
 
     def draw(self) -> Panel:
+        """The episodes of the next iteration."""
         return self.panel.take(np.concatenate([self._next(group, self.share) for group in range(len(self.groups))]))
 
     def _next(self, group: int, count: int) -> np.ndarray:

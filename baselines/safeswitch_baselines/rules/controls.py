@@ -63,13 +63,17 @@ class RandomControl(PlainMethod):
         """Solve for the hazard."""
         share, reference = reference_share(calibration)
         panel = calibration.panel
-        armed = np.maximum(panel.table.horizon - panel.arming_step, 1)
-
-        def excess(hazard: float) -> float:
-            return float(np.mean([_expected_share(hazard, int(steps)) for steps in armed])) - share
-
-        hazard = 0.0 if share <= 0 else 1.0 if excess(1.0) <= 0 else float(brentq(excess, 0.0, 1.0))
+        hazard = hazard_of(share, np.maximum(panel.table.horizon - panel.arming_step, 1))
         return Calibrated(RandomRule(hazard), hazard, reference.tuning_episodes, reference.expert_queries)
+
+
+def hazard_of(share: float, armed: Ints) -> float:
+    """Chance per step at which the expert drives `share` of the armed steps (E,) on average; 1 where it cannot."""
+
+    def excess(hazard: float) -> float:
+        return float(np.mean([_expected_share(hazard, int(steps)) for steps in armed])) - share
+
+    return 0.0 if share <= 0 else 1.0 if excess(1.0) <= 0 else float(brentq(excess, 0.0, 1.0))
 
 
 def _expected_share(hazard: float, steps: int) -> float:

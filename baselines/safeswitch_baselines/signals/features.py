@@ -151,7 +151,7 @@ class RND:
         self._size = int(arrays["size"])
         self._kept, self._mean, self._scale = arrays["kept"], arrays["mean"], arrays["scale"]
         self._level = float(arrays["level"])
-        self._target, self._predictor = _layers(arrays, "target"), _layers(arrays, "predictor")
+        self._target, self._predictor = layers(arrays, "target"), layers(arrays, "predictor")
 
     @classmethod
     def fit(cls, training: TrainingFeatures, seed: int) -> dict[str, NDArray[Any]]:
@@ -161,7 +161,7 @@ class RND:
         kept = varying(training.features)
         mean = training.features.mean(axis=0, dtype=np.float64)[kept].astype(np.float32)
         scale = training.features.std(axis=0, dtype=np.float64)[kept].astype(np.float32)
-        inputs = _standardised(training.features[:, kept], mean, scale, cls.clip)
+        inputs = standardised(training.features[:, kept], mean, scale, cls.clip)
         return {
             "size": np.array(training.features.shape[1]),
             "kept": kept,
@@ -176,22 +176,23 @@ class RND:
     def update(self, observation: NDArray[Any], prediction: Prediction, previous_action: Array | None) -> float:
         """Value at this step."""
         features = trunk_features(self.id, prediction, self._size)
-        inputs = _standardised(features[self._kept], self._mean, self._scale, self.clip)
-        error = _perceptron(self._target, inputs) - _perceptron(self._predictor, inputs)
+        inputs = standardised(features[self._kept], self._mean, self._scale, self.clip)
+        error = perceptron(self._target, inputs) - perceptron(self._predictor, inputs)
         return norm(error) ** 2 / (len(error) * self._level)
 
 
-def _standardised(features: Floats, mean: Floats, scale: Floats, clip: float) -> Floats:
+def standardised(features: Floats, mean: Floats, scale: Floats, clip: float) -> Floats:
+    """Features in standard deviations from their mean, cut off at `clip` of them."""
     return np.clip((features - mean) / scale, -clip, clip).astype(np.float32, copy=False)
 
 
-def _layers(arrays: Arrays, network: str) -> list[tuple[Floats, Floats]]:
+def layers(arrays: Arrays, network: str) -> list[tuple[Floats, Floats]]:
     """Weights (out, in) and biases (out,) of a network, first layer first."""
     count = sum(name.startswith(f"{network}-weight") for name in arrays)
     return [(arrays[f"{network}-weight{index}"], arrays[f"{network}-bias{index}"]) for index in range(count)]
 
 
-def _perceptron(layers: list[tuple[Floats, Floats]], inputs: Floats) -> Floats:
+def perceptron(layers: list[tuple[Floats, Floats]], inputs: Floats) -> Floats:
     """Outputs of a network with rectified hidden layers."""
     *hidden, (weight, bias) = layers
     for inner, offset in hidden:

@@ -1,4 +1,4 @@
-"""What the fitted signals learn from training features: covariances, principal axes, regressions, distillation.
+"""What fitted signals learn from training features: covariances, axes, regressions, classifiers, distillation.
 
 Everything runs on one torch thread, in double precision where matrices are factorised, in memory that torch aligned:
 the same arguments give the same bits.
@@ -7,6 +7,7 @@ the same arguments give the same bits.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,7 +25,9 @@ Floats = NDArray[np.float32]
 WIDTHS = (128, 64)
 """Hidden and output width of the random target; the predictor has one more hidden layer, as the paper's has."""
 BATCH, UPDATES, RATE = 256, 500, 1e-3
-"""How the predictor is trained; a fixed number of updates, whatever the number of training steps."""
+"""How networks are trained; a fixed number of updates, whatever the number of training steps."""
+CLASSIFIER, DECAY = 64, 1e-2
+"""Hidden units and weight decay of a classifier on features."""
 
 
 @dataclass(frozen=True)
@@ -125,10 +128,25 @@ def distil(inputs: Floats, seed: int) -> dict[str, Floats]:
         predictor = _perceptron((x.shape[1], hidden, hidden, output), seed, "rnd-predictor")
         with torch.inference_mode():
             wanted = target(x)
-        _imitate(predictor, x, wanted.clone(), seed)
+        _train(predictor, x, wanted.clone(), _mean_square, seed, "rnd-order")
         with torch.inference_mode():
             level = (predictor(x) - wanted).square().mean()
     return {"level": level.numpy(), **_arrays(target, "target"), **_arrays(predictor, "predictor")}
+
+
+def classify(inputs: Floats, labels: NDArray[np.bool_], seed: int) -> dict[str, Floats]:
+    """A network with `CLASSIFIER` rectified units whose output is the log-odds of `labels` (n,) given `inputs` (n, d).
+
+    Args:
+        inputs: standardised features.
+        labels: what to predict; cross-entropy.
+        seed: draws the network and the order of the samples.
+    """
+    with one_thread():
+        x, y = torch.tensor(inputs, dtype=torch.float32), torch.tensor(labels, dtype=torch.float32)[:, None]
+        network = _perceptron((x.shape[1], CLASSIFIER, 1), seed, "classifier")
+        _train(network, x, y, torch.nn.functional.binary_cross_entropy_with_logits, seed, "classifier-order", DECAY)
+    return _arrays(network, "classifier")
 
 
 def _perceptron(widths: tuple[int, ...], seed: int, name: str) -> nn.Sequential:
@@ -146,19 +164,31 @@ def _perceptron(widths: tuple[int, ...], seed: int, name: str) -> nn.Sequential:
     return nn.Sequential(*layers)
 
 
-def _imitate(predictor: nn.Sequential, inputs: Tensor, wanted: Tensor, seed: int) -> None:
-    """Train in place: squared error, Adam with a rate that falls to zero along a cosine."""
-    rng = stream(seed, "rnd-order")
-    optimiser = torch.optim.Adam(predictor.parameters(), lr=RATE)
+def _train(
+    network: nn.Sequential,
+    inputs: Tensor,
+    wanted: Tensor,
+    loss_of: Callable[[Tensor, Tensor], Tensor],
+    seed: int,
+    order_name: str,
+    decay: float = 0.0,
+) -> None:
+    """Train in place: Adam, with decoupled weight decay, and a rate that falls to zero along a cosine."""
+    rng = stream(seed, order_name)
+    optimiser = torch.optim.AdamW(network.parameters(), lr=RATE, weight_decay=decay)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, UPDATES)
     epochs = math.ceil(UPDATES * BATCH / len(inputs))
     order = torch.from_numpy(np.concatenate([rng.permutation(len(inputs)) for _ in range(epochs)]))
     for chosen in order[: UPDATES * BATCH].split(BATCH):
-        loss = (predictor(inputs[chosen]) - wanted[chosen]).square().mean()
+        loss = loss_of(network(inputs[chosen]), wanted[chosen])
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
         schedule.step()
+
+
+def _mean_square(output: Tensor, wanted: Tensor) -> Tensor:
+    return (output - wanted).square().mean()
 
 
 def _arrays(network: nn.Sequential, name: str) -> dict[str, Floats]:

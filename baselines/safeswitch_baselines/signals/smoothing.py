@@ -18,12 +18,14 @@ from numpy.typing import NDArray
 from safeswitch import registry
 from safeswitch.names import nearest, unknown
 from safeswitch.protocols import Array, Prediction, Signal, SignalContext
+from safeswitch_baselines.signals.discrepancy import Discrepancy
 from safeswitch_baselines.signals.dynamics import DynamicsResidual
 from safeswitch_baselines.signals.features import KNN, RND, Mahalanobis
 from safeswitch_baselines.signals.uncertainty import Aleatoric, Ensemble, Epistemic, Total
 
 SIGNALS: dict[str, Callable[..., Signal]] = {
-    each.id: each for each in (Epistemic, Aleatoric, Total, Ensemble, Mahalanobis, KNN, RND, DynamicsResidual)
+    each.id: each
+    for each in (Epistemic, Aleatoric, Total, Ensemble, Mahalanobis, KNN, RND, DynamicsResidual, Discrepancy)
 }
 """Factories of the unsmoothed signals by id. What they are called with depends on their kind, see `protocols`."""
 

@@ -58,6 +58,8 @@ class MPCConfig:
         angles: indexes of the state's components that are angles [rad]; they may arrive wrapped or unwrapped.
         surprise: a warm plan is challenged by a cold start when its cost exceeds the last one's by this factor and
         surprise_margin: by this much.
+        following: indexes of the parameters that follow the state along, such as the bends of the road ahead. Where any
+            other parameter changes, the warm plan is challenged by a cold start.
     """
 
     warm_iterations: int = 10
@@ -67,6 +69,7 @@ class MPCConfig:
     angles: tuple[int, ...] = ()
     surprise: float = 1.2
     surprise_margin: float = 1.0
+    following: tuple[int, ...] = ()
 
 
 class MPC:
@@ -74,6 +77,7 @@ class MPC:
 
     Attributes:
         solver: the generated DDP solver.
+        candidates: initial policies of a cold start.
         fallbacks: how often an action came from an old plan because the solver failed, since construction.
         cold_starts: plans made from scratch, since construction.
         iterations: DDP iterations, since construction.
@@ -86,7 +90,7 @@ class MPC:
         self.fallbacks = 0
         self.cold_starts = 0
         self.iterations = 0
-        self._candidates = candidates
+        self.candidates = candidates
         self._nx, self._nu, self._np = problem.nx, problem.nu, problem.np
         self._lo, self._hi = np.array(problem.u_lo), np.array(problem.u_hi)
         self._angles = list(self.config.angles)
@@ -99,6 +103,7 @@ class MPC:
         self._plan = np.zeros_like(self._plan_out)
         self._gains = np.zeros_like(self._gains_out)
         self._parameters = np.zeros(self._np)
+        self._model = np.setdiff1d(np.arange(self._np), self.config.following)
         self._cost = np.inf
         self._age = -1  # steps since the plan in `_plan` was made; -1: no plan
 
@@ -146,7 +151,7 @@ class MPC:
         """Make a plan from `state`: warm if there is one to start from. False when no finite plan was found."""
         if self._age < 0:
             return self._cold(state, parameters)
-        expected, changed = self._cost, bool((parameters != self._parameters).any())
+        expected, changed = self._cost, bool((parameters != self._parameters)[self._model].any())
         good = self._warm(state, parameters)
         # Another model, or a cost that jumped (a push): the shifted plan may sit in a poor local minimum.
         if not good or changed or self._cost > self.config.surprise * expected + self.config.surprise_margin:
@@ -177,7 +182,7 @@ class MPC:
             self._x0[i] = _wrapped(state[i])
         self._p[:] = parameters
         best, best_plan, best_gains = np.inf, None, None
-        for policy in self._candidates(self._x0.copy(), parameters):
+        for policy in self.candidates(self._x0.copy(), parameters):
             self._plan_in[:, : self._nx] = policy.x
             self._plan_in[:horizon, self._nx :] = policy.u
             self._gains_in.reshape(horizon, self._nx, self._nu)[:] = np.swapaxes(

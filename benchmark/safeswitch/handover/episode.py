@@ -2,10 +2,14 @@
 
 An alarm at step t hands over from t + 1, as in the paper: the step on which the rule decides is executed first. The
 learner predicts and the signals are computed at every step, whoever drives; a rule is asked only once it is armed.
+
+Besides the signals a rule is told `DEVIATION` at every step at which the expert's action is known: where the expert
+drives, and everywhere for a rule that is given an adviser.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -18,6 +22,9 @@ from safeswitch.protocols import Arming, Array, Driver, Expert, Learner, Signal,
 if TYPE_CHECKING:
     from safeswitch.tasks.base import TaskEnv
 
+DEVIATION = "deviation"
+"""Name under which a rule is told |a_learner - a_expert|, the Euclidean norm in action units."""
+
 
 @dataclass(frozen=True)
 class Episode:
@@ -25,7 +32,7 @@ class Episode:
 
     Attributes:
         seed: episode seed.
-        onset: step t0 of the disturbance, -1 when undisturbed.
+        onset: step t0 of the disturbance, -1 when undisturbed; T when the disturbance never came into view.
         arming_step: first step at which the rule was asked.
         length: steps executed; < T after an early failure.
         success: the task's criterion at the end.
@@ -91,7 +98,7 @@ class NeverSwitch:
 
 
 def arming_step(onset: int | None, arming: Arming, horizon: int) -> int:
-    """First step at which the monitor is on: t0 under `onset` (T, i.e. never, when undisturbed), 0 under `start`."""
+    """First step at which the monitor is on: t0 under `onset` (T, that is never, undisturbed), 0 under `start`."""
     if arming == "start":
         return 0
     if arming == "onset":
@@ -108,6 +115,7 @@ def run_episode(
     seed: int,
     arming: Arming = "start",
     record_snapshots: bool = False,
+    adviser: Expert | None = None,
 ) -> Episode:
     """Drive the episode `seed` of `env` with the learner, and with the expert whenever `rule` says so.
 
@@ -120,6 +128,8 @@ def run_episode(
         seed: episode seed.
         arming: when the rule is switched on.
         record_snapshots: keep what a later continuation from any step needs.
+        adviser: an expert of its own that is asked at every armed step which the learner drives, and whose action is
+            never executed; for rules that need expert queries.
     """
     env.reset(seed=seed)
     learner.reset(seed)
@@ -127,8 +137,6 @@ def run_episode(
     for signal in signals:
         signal.reset()
     horizon = env.horizon
-    onset = -1 if env.onset is None else int(env.onset)
-    armed_from = arming_step(env.onset, arming, horizon)
     driven = np.full(horizon, -1, np.int8)
     actions = np.full((horizon, *env.simulator.action_shape), np.nan)
     states = np.full((horizon + 1, env.state.size), np.nan)
@@ -141,9 +149,12 @@ def run_episode(
         observation = env.observe()
         prediction = learner.predict(observation, step)
         values = {signal.id: signal.update(observation, prediction, previous) for signal in signals}
+        armed_from = arming_step(env.onset, arming, horizon)  # of a placed disturbance: T until it is in view
         if step == armed_from:
             driver = Driver(rule.arm(step))
         action = _expert_action(env, expert, driven, step) if driver is Driver.EXPERT else prediction.action
+        if adviser is not None and driver is Driver.LEARNER and step >= armed_from:
+            advice = _advice(env, adviser, driven, step, armed_from)
         env.advance(action)
         driven[step], actions[step], states[step + 1] = driver, action, env.state
         for name, value in values.items():
@@ -151,9 +162,15 @@ def run_episode(
         if record_snapshots:
             snapshots.append(env.snapshot())
         if step >= armed_from:
+            if driver is Driver.EXPERT:
+                values[DEVIATION] = _distance(prediction.action, action)
+            elif adviser is not None:
+                values[DEVIATION] = _distance(prediction.action, advice)
             driver = Driver(rule.update(step, values))
         previous = actions[step]
     length = env.step_index
+    onset = -1 if env.onset is None else env.onset
+    armed_from = arming_step(env.onset, arming, horizon)
     return Episode(
         seed, onset, armed_from, length, env.is_success, driven, actions, states, traces, _stack(snapshots, horizon)
     )
@@ -173,6 +190,17 @@ def _expert_action(env: TaskEnv, expert: Expert | None, driven: NDArray[Any], st
     if step == 0 or driven[step - 1] != Driver.EXPERT:
         expert.reset()
     return expert.action(env.state, env.parameters)
+
+
+def _advice(env: TaskEnv, adviser: Expert, driven: NDArray[Any], step: int, armed_from: int) -> Array:
+    """What the adviser would do; it plans from scratch when it is first asked, and after the expert has driven."""
+    if step == armed_from or driven[step - 1] == Driver.EXPERT:
+        adviser.reset()
+    return adviser.action(env.state, env.parameters)
+
+
+def _distance(one: Array, other: Array) -> float:
+    return math.dist(one, other)
 
 
 def _stack(snapshots: list[Array], horizon: int) -> Array | None:

@@ -50,7 +50,7 @@ def shown_traces(
             observation = env.observe()
             visible[episode, step] = env.disturbed and not np.array_equal(observation, env.observe(clean=True))
             prediction = learner.predict(observation, step)
-            executed = env.simulator.data.ctrl.copy() if step else None
+            executed = env.simulator.action.copy() if step else None
             for signal in signals:
                 traces[signal.id][episode, step] = signal.update(observation, prediction, executed)
     return traces, visible

@@ -35,7 +35,8 @@ class HandoverTable:
 
     Attributes:
         seeds: (E,) episode seeds.
-        onset: (E,) step t0, -1 where undisturbed.
+        onset: (E,) step t0 of the learner-only trajectory, -1 where undisturbed, T where the disturbance never came
+            into view on it.
         length: (E,) steps of the learner-only episode; < T after an early failure.
         learner_success: (E,) whether the learner alone succeeds.
         signals: signal id -> (E, T), NaN after an early end.

@@ -9,23 +9,28 @@ from typing import Any
 import pandas as pd
 
 from safeswitch.scoring.leaderboard import write_text
-from safeswitch.scoring.metrics import MIN_CONTEST, OTHER_PHIS, PHI, REFERENCES, signal_of
+from safeswitch.scoring.metrics import MIN_CONTEST, OTHER_PHIS, OTHERS, PHI, REFERENCES, signal_of
+from safeswitch.suite import SHARES
 
 PAPER_CELLS: Mapping[str, tuple[str, int]] = {"cart-pole": ("cart-mass", 3)}
 """Task -> (disturbance, severity) of the paper, when the caller does not say."""
 PAPER_METHOD = "cem@total"
 UPPER_BOUNDS = ("oracle-", "best@")
 BLIND_CONTROLS = ("shuffled", "random", "periodic")
+MATCHED_SHARES = tuple(f"{rule}-{share}" for share in SHARES for rule in ("share", "random"))
 BLANK = "–"
 
 Row = Mapping[str, Any]
 
 
 def standing(method: str, privileged: Collection[str] = (), give_back: Collection[str] = ()) -> str:
-    """Where a method is ranked: "bound", "control", "reference", "give-back" or "rule"."""
+    """Where a method is ranked: "bound", "control", "share", "reference", "give-back" or "rule"."""
+    rule = method.partition("@")[0]
     if method.startswith(UPPER_BOUNDS) or method in privileged:
         return "bound"
-    if method.partition("@")[0] in BLIND_CONTROLS:
+    if rule in MATCHED_SHARES:
+        return "share"
+    if rule in BLIND_CONTROLS:
         return "control"
     if method in REFERENCES:
         return "reference"
@@ -39,6 +44,8 @@ def write_markdown(
     privileged: Collection[str] = (),
     give_back: Collection[str] = (),
     notes: Sequence[str] = (),
+    needs: Mapping[str, str] | None = None,
+    first: Mapping[str, Sequence[str]] | None = None,
 ) -> Path:
     """Write the leaderboard for readers.
 
@@ -49,13 +56,20 @@ def write_markdown(
         privileged: further methods that use what a deployed rule cannot know.
         give_back: methods that may return control to the learner; they are ranked apart.
         notes: lines put under the title, for example the profile and the commit.
+        needs: method -> what it needs, as it stands in the tables.
+        first: task -> lines put before its tables, for example the headline that leaves a disturbance out.
     """
     chosen = PAPER_CELLS if paper_cells is None else paper_cells
-    table = table.assign(standing=[standing(name, privileged, give_back) for name in table["method"]])
+    if "calibrated_on" in table:  # the rows that leave a disturbance out are summed up in `first`
+        table = table[table["calibrated_on"] != OTHERS]
+    table = table.assign(
+        standing=[standing(name, privileged, give_back) for name in table["method"]],
+        needs=[(needs or {}).get(name, BLANK) for name in table["method"]],
+    )
     lines = ["# SafeSwitch leaderboard", "", *(f"{note}  " for note in notes), ""]
     for task, rows in table.groupby("task", sort=True):
         paper = chosen.get(str(task))
-        lines += [f"## {task}", "", *_headline(rows, paper), *_cells(rows, paper)]
+        lines += [f"## {task}", "", *(first or {}).get(str(task), ()), *_headline(rows, paper), *_cells(rows, paper)]
     lines += _legend()
     write_text(path, "\n".join(lines).rstrip() + "\n")
     return path
@@ -90,15 +104,15 @@ def _headline_table(part: pd.DataFrame) -> list[str]:
         [
             label,
             _name(row),
-            _interval(row, "return_mean", "return"),
-            *(_number(row[f"return_phi{phi:g}"]) for phi in OTHER_PHIS),
+            interval(row, "return_mean", "return"),
+            *(number(row[f"return_phi{phi:g}"]) for phi in OTHER_PHIS),
             _skill(row),
-            _interval(row, "success", "success"),
-            _number(row["autonomy"]),
+            interval(row, "success", "success"),
+            number(row["autonomy"]),
         ]
         for label, row in shown
     ]
-    return _table([*header, "autonomy"], body)
+    return markdown_table([*header, "autonomy"], body)
 
 
 def _contest(part: pd.DataFrame) -> str:
@@ -137,32 +151,35 @@ def _cells(rows: pd.DataFrame, paper: tuple[str, int] | None) -> list[str]:
 def _cell_tables(part: pd.DataFrame) -> list[str]:
     ranked = _ranked(part)
     competing = ranked[ranked["standing"].isin(["rule", "reference"])]
-    lines = [*_table(_HEADER, map(_cell_row, _records(competing))), ""]
+    lines = [*markdown_table(_HEADER, map(_cell_row, _records(competing))), ""]
     apart = {
         "give-back": "Rules that may give control back, ranked apart:",
         "bound": "*Bounds: they use hindsight or privileged knowledge and do not compete.*",
+        "share": "At a matched share of expert steps (5, 10, 20, 40 % on calibrate episodes); `random-` is blind:",
         "control": "*Blind controls: a rule that does not beat them has learned nothing from its signal.*",
     }
     for standing_name, caption in apart.items():
         group = ranked[ranked["standing"] == standing_name]
         if not group.empty:
-            lines += [caption, "", *_table(_HEADER, map(_cell_row, _records(group))), ""]
+            lines += [caption, "", *markdown_table(_HEADER, map(_cell_row, _records(group))), ""]
     return lines
 
 
 _HEADER = [
-    "method", "return", "skill", "success", "autonomy", "recovery", "harm", "timely", "false alarms", "tuning episodes",
+    "method", "needs", "return", "skill", "success", "autonomy", "recovery", "harm", "timely", "false alarms",
+    "tuning episodes",
 ]  # fmt: skip
 
 
 def _cell_row(row: Row) -> list[str]:
     return [
         _name(row),
-        _interval(row, "return_mean", "return"),
-        _skill(row, interval=True),
-        _interval(row, "success", "success"),
-        *(_number(row[name]) for name in ("autonomy", "recovery", "harm", "timely", "false_alarms")),
-        _number(row["tuning_episodes"], 0),
+        str(row["needs"]),
+        interval(row, "return_mean", "return"),
+        _skill(row, bounds=True),
+        interval(row, "success", "success"),
+        *(number(row[name]) for name in ("autonomy", "recovery", "harm", "timely", "false_alarms")),
+        number(row["tuning_episodes"], 0),
     ]
 
 
@@ -184,21 +201,23 @@ def _name(row: Row) -> str:
     return marked.get(row["standing"], name)
 
 
-def _skill(row: Row, interval: bool = False) -> str:
+def _skill(row: Row, bounds: bool = False) -> str:
     if pd.isna(row["contest_gap"]):
         return BLANK
     if pd.isna(row["skill"]):
         return "no contest"
-    return _interval(row, "skill", "skill") if interval else _number(row["skill"])
+    return interval(row, "skill", "skill") if bounds else number(row["skill"])
 
 
-def _interval(row: Row, estimate: str, bounds: str) -> str:
+def interval(row: Row, estimate: str, bounds: str) -> str:
+    """Estimate with its bounds, for readers."""
     if pd.isna(row[estimate]):
         return BLANK
-    return f"{_number(row[estimate])} [{_number(row[f'{bounds}_lo'])}, {_number(row[f'{bounds}_hi'])}]"
+    return f"{number(row[estimate])} [{number(row[f'{bounds}_lo'])}, {number(row[f'{bounds}_hi'])}]"
 
 
-def _number(value: Any, digits: int = 2) -> str:
+def number(value: Any, digits: int = 2) -> str:
+    """A number for readers; blank for NaN, and no minus before zero."""
     if pd.isna(value):
         return BLANK
     text = f"{value:.{digits}f}"
@@ -214,9 +233,9 @@ def _protocol(name: str) -> str:
     return {"onset": "armed at the onset, as in the paper", "start": "armed from step 0, as deployed"}.get(name, name)
 
 
-def _table(header: Sequence[str], body: Iterable[Sequence[str]]) -> list[str]:
+def markdown_table(header: Sequence[str], body: Iterable[Sequence[str]]) -> list[str]:
     """Markdown table: words flush left, numbers flush right."""
-    words = ("", "method")
+    words = ("", "method", "needs")
     rule = [":--" if name in words else "--:" for name in header]
     return [f"| {' | '.join(cells)} |" for cells in (header, rule, *body)]
 
@@ -232,6 +251,8 @@ def _legend() -> list[str]:
         f"`no contest` where these two are less than {MIN_CONTEST:g} apart.",
         "* *Slanted*: references, bounds (†: hindsight or privileged) and blind controls (‡).",
         "* Thresholds are calibrated for the headline's return; the columns of other phi score the same episodes.",
+        "* Needs: what calibration or decision requires beyond the learner and undisturbed episodes. F: episodes that "
+        "fail; R: episodes with disturbances; Q: the expert is asked at every step; P: privileged knowledge.",
         f"* {BLANK}: the score does not apply (for example false alarms without undisturbed episodes).",
         "* Every score is defined in `docs/scores.md`; `leaderboard.csv` has all columns.",
     ]

@@ -23,6 +23,8 @@ OTHER_PREVALENCES = (0.1, 0.9)
 """Shares of disturbed episodes to which the half-and-half `start` returns are re-weighted."""
 REFERENCES = ("learner", "expert", "timer")
 """The methods whose best return is the zero of skill, R0."""
+OTHERS = "other disturbances"
+"""`calibrated_on` of the rows whose threshold has not seen the disturbance that it is tested on."""
 MIN_CONTEST = 0.1
 """Below this distance between R0 and the hindsight best a cell is no contest and has no skill."""
 
@@ -118,7 +120,7 @@ def _check_ranges(frame: pd.DataFrame, infos: Mapping[str, TaskInfo]) -> None:
         "0 <= learner_steps <= T": frame["learner_steps"].between(0, horizon),
         "0 <= armed_learner_steps <= learner_steps": frame["armed_learner_steps"].between(0, frame["learner_steps"]),
         "onset >= 0 where disturbed and -1 elsewhere": (frame["onset"] >= 0) == frame["disturbed"],
-        "onset < T": frame["onset"] < horizon,
+        "onset <= T": frame["onset"] <= horizon,
         "protocol 'onset' has disturbed episodes only": (frame["protocol"] != "onset") | frame["disturbed"],
     }
     for law, holds in laws.items():

@@ -4,13 +4,15 @@ An episode is a function of its seed. Three named streams feed it, `initial-stat
 undisturbed twin (same seed, ``disturbance=None``) starts in the same state and is identical until the onset step t0.
 
 The disturbance sets in before the observation of step t0: from there on the simulator steps with its disturbed model.
-Which model is in force is a function of the step index alone; therefore `restore` needs no memory of what happened.
+t0 is drawn, and which model is in force is a function of the step index alone. A `placed` disturbance is different:
+it stands in the world from the reset on, and t0 is the first step at which the trajectory at hand shows it. Until then
+nothing that is observed, and no parameter, tells of it; a snapshot remembers whether it has been seen.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, SupportsFloat
 
 import gymnasium as gym
@@ -20,15 +22,16 @@ from numpy.typing import NDArray
 
 from safeswitch.protocols import Expert
 from safeswitch.seeding import stream
-from safeswitch.tasks import checks, visual  # noqa: F401  (registers the disturbances of images)
+from safeswitch.tasks import checks, rally_disturbances, rally_visual, visual  # noqa: F401  (register disturbances)
 from safeswitch.tasks.disturbances import Disturbance, make_disturbance
 from safeswitch.tasks.rendering import Image, Renderer
 from safeswitch.tasks.simulator import Simulator
 
 Array = NDArray[np.float64]
 
-HEADER = 4
-"""Leading numbers of a snapshot: episode seed, step index, consecutive good states, terminated."""
+HEADER = 5
+"""Leading numbers of a snapshot: episode seed, step index, consecutive good states, terminated, and the onset of what
+is placed (-1 until it is in view)."""
 
 
 class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
@@ -122,6 +125,18 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
         """Observation of the current state under the `disturbance` in force (None: as in the undisturbed task)."""
         raise NotImplementedError
 
+    def _sees(self, disturbance: Disturbance) -> bool:
+        """Whether the placed `disturbance` is in view in the current state."""
+        raise NotImplementedError
+
+    def _actuator(self) -> Callable[[Array], None] | None:
+        """Makes the controls from an action (nu,); None where the action is the controls."""
+        return None
+
+    def _watcher(self) -> Callable[[], None] | None:
+        """What to call after every simulator step of the coming control step; None for nothing."""
+        return None
+
     def make_expert(self) -> Expert:
         """The model-predictive expert of this task."""
         raise NotImplementedError
@@ -135,7 +150,8 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
 
         Args:
             seed: episode seed. None draws one from `np_random`.
-            options: `initial_state` (nx,) and `onset` (0 .. T - 1) replace what the seed would give.
+            options: `initial_state` (nx,) and `onset` (0 .. T - 1) replace what the seed would give. The onset of a
+                placed disturbance is seen on the way, and cannot be given.
 
         Returns:
             Observation and info of step 0.
@@ -153,7 +169,7 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
         self._prepare_disturbance(self._episode_seed, options.get("onset"))
         good, self._terminated = self._judge()
         self._good_steps = int(good)
-        self.simulator.choose(self.disturbed)
+        self._look()
         return self.observe(), self._info()
 
     def step(self, action: NDArray[Any]) -> tuple[NDArray[Any], SupportsFloat, bool, bool, dict[str, Any]]:
@@ -181,12 +197,11 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
             raise checks.invalid_action(action, self.simulator.action_shape)
         if self._episode_seed is None or self.done:
             raise checks.not_running(self._episode_seed is not None, self._step_index, self._terminated)
-        self.simulator.advance(command, self._force())
+        self.simulator.advance(command, self._force(), self._actuator(), self._watcher())
         self._step_index += 1
         good, self._terminated = self._judge()
         self._good_steps = self._good_steps + 1 if good else 0
-        if self._step_index == self._onset:
-            self.simulator.choose(True)
+        self._look()
 
     def observe(self, clean: bool = False) -> NDArray[Any]:
         """Observation of the current step; `clean=True` gives the same state without the disturbance."""
@@ -199,14 +214,14 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
             return None
         if self._renderer is None:
             self._renderer = Renderer(self.simulator.nominal, self.width, self.height, self.camera)
-        return self._draw(self._renderer, self.disturbance if self.disturbed else None)
+        return self._draw(self._renderer, self.disturbance if self.disturbed or self._placed else None)
 
     def _draw(self, renderer: Renderer, disturbance: Disturbance | None) -> Image:
         """Picture of the current state, with the looks of the `disturbance` in force."""
         model = self.simulator.nominal
-        if disturbance is not None and self._onset is not None:
+        if disturbance is not None:
             model = self.simulator.disturbed
-            disturbance.show(model, self._step_index - self._onset)
+            disturbance.show(model, self._step_index - (self._onset or 0))
         self.simulator.update_kinematics(model)
         return renderer.render(model, self.simulator.data)
 
@@ -232,8 +247,11 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
 
     @property
     def onset(self) -> int | None:
-        """t0, the first step that is observed under the disturbance; None in an undisturbed episode."""
-        return self._onset
+        """t0, the first step that is observed under the disturbance; None in an undisturbed episode.
+
+        T as long as a placed disturbance has not come into view; it may never do so.
+        """
+        return self.horizon if self._onset is None and self.disturbance is not None else self._onset
 
     @property
     def disturbed(self) -> bool:
@@ -270,7 +288,8 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
     def snapshot(self) -> Array:
         """Everything that the rest of the episode depends on, besides its seed and options, as one vector."""
         snapshot = np.empty(HEADER + self.simulator.state_size)
-        snapshot[:HEADER] = (self._seed_key(), self._step_index, self._good_steps, self._terminated)
+        onset = self._onset if self._placed and self._onset is not None else -1  # a drawn one follows from the seed
+        snapshot[:HEADER] = (self._seed_key(), self._step_index, self._good_steps, self._terminated, onset)
         self.simulator.read(snapshot[HEADER:])
         return snapshot
 
@@ -295,7 +314,9 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
         self._step_index, self._good_steps = int(snapshot[1]), int(snapshot[2])
         self._terminated = bool(snapshot[3])
         self.simulator.write(snapshot[HEADER:])
-        self.simulator.choose(self.disturbed)
+        if self._placed:
+            self._onset = None if snapshot[4] < 0 else int(snapshot[4])
+        self._look()
 
     def __getstate__(self) -> dict[str, Any]:
         """Arguments, generator and snapshot: a pickled environment continues its episode, without the simulator."""
@@ -324,11 +345,32 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
         if self.disturbance is None:
             self._onset = None
             return
-        drawn = self._draw_onset(stream(seed, "onset"))
-        self._onset = drawn if given_onset is None else checks.check_onset(given_onset, self.horizon)
+        if self._placed:
+            if given_onset is not None:
+                name = self.disturbance.name  # type: ignore[union-attr]
+                raise ValueError(f"the onset of {name!r} is the first step at which it is in view: it cannot be given")
+            self._onset = None
+        else:
+            drawn = self._draw_onset(stream(seed, "onset"))
+            self._onset = drawn if given_onset is None else checks.check_onset(given_onset, self.horizon)
         self.disturbance.reset(stream(seed, "disturbance"), self.horizon)
+        self._place(self.disturbance, stream(seed, "place"))
         self.simulator.disturb(self.disturbance)
         self._disturbed_parameters = self._read_parameters(self.simulator.disturbed)
+
+    @property
+    def _placed(self) -> bool:
+        """Whether the onset is seen on the way."""
+        return self.disturbance is not None and self.disturbance.placed
+
+    def _place(self, disturbance: Disturbance, rng: np.random.Generator) -> None:
+        """Put a disturbance, which knows what it is, somewhere in this episode's world; `rng` is its own stream."""
+
+    def _look(self) -> None:
+        """Set the onset of a placed disturbance when it comes into view, and choose the model that is in force."""
+        if self._placed and self._onset is None and self._sees(self.disturbance):  # type: ignore[arg-type]
+            self._onset = self._step_index
+        self.simulator.choose(self.disturbed or self._placed)
 
     def _draw_onset(self, rng: np.random.Generator) -> int:
         """Uniform in the onset range, both ends included."""
@@ -349,7 +391,7 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
             "is_success": self.is_success,
             "disturbed": self.disturbed,
             "step": self._step_index,
-            "onset": -1 if self._onset is None else self._onset,
+            "onset": -1 if self.onset is None else self.onset,
         }
 
     def _seed_key(self) -> float:

@@ -41,6 +41,8 @@ class Disturbance:
         sentence: description with one placeholder for the value.
         changes_inertia: whether constants that MuJoCo derives from masses must be recomputed after `alter`.
         only_seen: whether it changes what is seen alone, so that the same state can be observed without it.
+        placed: whether it stands in the world from the reset on; its onset is then the first step at which it is in
+            view, and not drawn.
     """
 
     name: ClassVar[str]
@@ -51,6 +53,7 @@ class Disturbance:
     sentence: ClassVar[str]
     changes_inertia: ClassVar[bool] = False
     only_seen: ClassVar[bool] = False
+    placed: ClassVar[bool] = False
 
     def __init__(self, severity: int) -> None:
         self.severity = check_severity(severity)

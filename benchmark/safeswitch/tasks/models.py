@@ -40,12 +40,12 @@ def assets_folder() -> Path:
 
 def compose(base: str, model: str = "common/scene.xml") -> Any:
     """MJCF tree of the scene `model` with the robot `base` merged into it, names kept; both relative to `assets`."""
-    scene = _part(model)
-    scene.include_copy(_part(base), override_attributes=True)
+    scene = part(model)
+    scene.include_copy(part(base), override_attributes=True)
     return scene
 
 
-def _part(path: str) -> Any:
+def part(path: str) -> Any:
     """MJCF tree of one file below `assets`."""
     with switched_off():  # dm_control composes and never draws: it need not start OpenGL
         from dm_control import mjcf
@@ -69,7 +69,7 @@ def cart_pole(config: CartPoleConfig) -> mujoco.MjModel:
 def cart_pole_image(config: CartPoleConfig) -> mujoco.MjModel:
     """The same physics in a studio: a wall, props, a third-person camera, and a pole that 64 pixels can show."""
     tree = _cart_pole_tree(config)
-    tree.include_copy(_part("cart_pole/studio.xml"))
+    tree.include_copy(part("cart_pole/studio.xml"))
     rod, bob = tree.find("geom", "pole"), tree.find("geom", "bob")
     rod.size = [ROD_RADIUS, rod.size[1]]
     bob.size = [BOB_RADIUS]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Callable
 
 import mujoco
 import numpy as np
@@ -24,11 +25,15 @@ STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION.value)
 class Simulator:
     """MuJoCo state of one environment, and the models that move it.
 
+    Where a model has user data (`nuserdata`), they hold the action in force, and the task makes the controls from it;
+    elsewhere the action is the controls.
+
     Attributes:
         nominal: the undisturbed model; nothing writes to it.
         disturbed: the model from the onset on; the same object where no disturbance is given.
         model: the one of the two that is in force.
         data: the state.
+        action: (nu,) the action in force, part of the state.
     """
 
     def __init__(self, model: mujoco.MjModel, control_dt: float, *, disturbance: bool) -> None:
@@ -38,9 +43,9 @@ class Simulator:
         self.model = self.nominal
         self.data = mujoco.MjData(self.nominal)
         self._scratch = mujoco.MjData(self.nominal)
-        self._ctrl = self.data.ctrl
+        self.action: Array = self.data.userdata if self.nominal.nuserdata else self.data.ctrl
         self._substeps = count_substeps(control_dt, model.opt.timestep)
-        self.action_shape = self._ctrl.shape
+        self.action_shape = self.action.shape
         self.state_size = mujoco.mj_stateSize(self.nominal, STATE)
 
     def reset(self) -> None:
@@ -59,13 +64,33 @@ class Simulator:
         """Put one of the two models in force."""
         self.model = self.disturbed if disturbed else self.nominal
 
-    def advance(self, command: Array, force: Array | None) -> None:
-        """One control step with `command` (nu,), clipped to [-1, 1], and a generalised `force` (nv,) or None."""
-        np.maximum(command, -1.0, out=self._ctrl)  # half the time of np.clip
-        np.minimum(self._ctrl, 1.0, out=self._ctrl)
+    def advance(
+        self,
+        command: Array,
+        force: Array | None,
+        actuate: Callable[[Array], None] | None = None,
+        watch: Callable[[], None] | None = None,
+    ) -> None:
+        """One control step.
+
+        Args:
+            command: (nu,), clipped to [-1, 1].
+            force: generalised force (nv,), or None.
+            actuate: makes the controls from the clipped action, where they are not the same.
+            watch: called after every simulator step, where one has to look that closely.
+        """
+        np.maximum(command, -1.0, out=self.action)  # half the time of np.clip
+        np.minimum(self.action, 1.0, out=self.action)
         if force is not None:
             self.data.qfrc_applied[:] = force
-        mujoco.mj_step(self.model, self.data, nstep=self._substeps)
+        if actuate is not None:
+            actuate(self.action)
+        if watch is None:
+            mujoco.mj_step(self.model, self.data, nstep=self._substeps)
+            return
+        for _ in range(self._substeps):
+            mujoco.mj_step(self.model, self.data)
+            watch()
 
     def read(self, out: Array) -> None:
         """Write the full integration state into `out` (state_size,)."""

@@ -241,6 +241,7 @@ class PixelNoise(Visual):
 
     name = "pixel-noise"
     kind = "sensing"
+    tasks = IMAGES | {"rally-car-image"}
     levels = (0.02, 0.04, 0.08, 0.14, 0.22)
     sentence = "Gaussian noise of std {:g} times the full range is added to every pixel"
 
