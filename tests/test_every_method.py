@@ -95,6 +95,19 @@ def check_drivers(rule: Any, panel: Panel) -> None:
         assert set(first) <= set(Driver) and drivers(episode) == first
 
 
+@pytest.mark.parametrize("name", METHODS)
+def test_a_rule_reads_no_other_signals_than_it_says(name: str) -> None:
+    """Plain episodes compute the signals that a rule reads, and no others."""
+    method, calibrated, panel = calibrate(name, 0, "start")
+    if method.latched or calibrated.reads is None:
+        return
+    rule = calibrated.rule
+    rule.reset(0)
+    rule.arm(0)
+    for step in range(int(panel.table.length[0])):
+        rule.update(step, {name: 1.0 for name in calibrated.reads} | {DEVIATION: 0.1})
+
+
 @pytest.mark.parametrize("arming", ARMINGS)
 @pytest.mark.parametrize("name", METHODS)
 def test_calibration_is_a_function_of_its_arguments(name: str, arming: Any) -> None:

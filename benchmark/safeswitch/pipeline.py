@@ -184,7 +184,7 @@ class Run:
                 cell,
                 self.trained[seed],
                 keys,
-                tables[seed, str(self.task.undisturbed(cell))].test[: None if cell in self.profile.cells_of(self.task) else chunks],
+                tables[seed, str(self.task.undisturbed(cell))].test[: None if (seed, cell) in test else chunks],
             )
             for (seed, cell), keys in {**test, **further}.items()
         ]

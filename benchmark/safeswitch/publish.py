@@ -23,6 +23,7 @@ from safeswitch.scoring.leaderboard import leaderboard, merge_task_rows, read_cs
 from safeswitch.scoring.left_out import left_out_lines, left_out_table
 from safeswitch.scoring.markdown import write_markdown
 from safeswitch.scoring.metrics import TaskInfo
+from safeswitch.scoring.sightings import sighting_table
 from safeswitch.scoring.signal_quality import signal_table
 from safeswitch.scoring_stages import calibration_of, protocols_of
 from safeswitch.stages import Job, load_rows, source_of
@@ -53,6 +54,9 @@ def publish(run: Run, folder: Path | None = None) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     for name in TABLES:
         _merge(folder / f"{name}.csv", read_csv(run.store.folder(scores.key) / f"{name}.csv"))
+    sightings = run.store.folder(scores.key) / "sightings.csv"
+    if sightings.exists():
+        _merge(folder / "sightings.csv", read_csv(sightings))
     _merge(folder / "cem_seeds.csv", load_rows(run.store, spread, "cem_seeds.npz"))
     if run.literal is not None:
         for name in ("leaderboard", "signals"):
@@ -106,6 +110,9 @@ def _score(folder: Path, root: str, task: Task, info: TaskInfo, episodes: list[J
     write_csv(left_out_table(rows, infos), folder / "left_out.csv")
     write_csv(paired_comparisons(rows, infos), folder / "comparisons.csv")
     write_csv(signal_table(load_rows(store, signals, "signals.npz")), folder / "signals.csv")
+    seen = load_rows(store, signals, "sightings.npz")
+    if len(seen):
+        write_csv(sighting_table(seen), folder / "sightings.csv")
 
 
 def spread_job(store: Store, task: Task, learner: int, tables: CellTables) -> Job:

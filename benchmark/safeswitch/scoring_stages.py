@@ -18,11 +18,12 @@ from safeswitch.handover.episode import run_episode
 from safeswitch.handover.panel import Calibration, Panel
 from safeswitch.handover.shown import shown_traces
 from safeswitch.handover.table import HandoverTable, concatenate
-from safeswitch.protocols import ARMINGS, Arming
+from safeswitch.protocols import ARMINGS, Arming, Calibrated
 from safeswitch.scoring.metrics import OTHERS
 from safeswitch.scoring.rows import episode_rows, latched_rows
+from safeswitch.scoring.sightings import sightings
 from safeswitch.scoring.signal_quality import SignalQuality, frame_quality, signal_quality
-from safeswitch.stages import CellTables, Job, concat, load_table, make_env, only_seen, recorded_table, source_of
+from safeswitch.stages import CellTables, Job, can_be_shown, concat, load_table, make_env, recorded_table, source_of
 from safeswitch.store import Store
 from safeswitch.suite import Cell, Task, methods
 from safeswitch.trained import Trained
@@ -71,7 +72,7 @@ def _score_episodes(
             if method.latched:
                 rows = latched_rows(test, calibrated)
             else:
-                rows = plain_rows(task, cell, trained, test, method, calibrated.rule)
+                rows = plain_rows(task, cell, trained, test, method, calibrated)
             frames.append(labelled(rows, cell, protocol, method_id, trained.seed, calibrated, own))
             logs.update({f"{protocol}|{method_id}|{name}": value for name, value in calibrated.log.items()})
         if others is not None:
@@ -123,9 +124,12 @@ def _panel(table: HandoverTable, nominal: HandoverTable, cell: Cell, protocol: A
     return Panel(concatenate([table, nominal]) if protocol == "start" else table, protocol)
 
 
-def plain_rows(task: Task, cell: Cell, trained: Trained, test: Panel, method: Method, rule: Any) -> pd.DataFrame:
+def plain_rows(
+    task: Task, cell: Cell, trained: Trained, test: Panel, method: Method, calibrated: Calibrated
+) -> pd.DataFrame:
     """Rules that give control back have no table: drive the same episodes."""
-    driver, signals = trained.learner(task), trained.signals(task, getattr(rule, "reads", None))
+    driver, rule, reads = trained.learner(task), calibrated.rule, calibrated.reads
+    signals = [signal for signal in trained.signals(task) if reads is None or signal.id in reads]
     envs = {True: make_env(task, cell), False: make_env(task, task.undisturbed(cell))}
     experts = {kind: env.make_expert() for kind, env in envs.items()}
     advisers = {kind: env.make_expert() if "expert-queries" in method.needs else None for kind, env in envs.items()}
@@ -161,8 +165,8 @@ def signals_job(
 ) -> Job:
     """Signal quality of one (learner, cell), from tables of test episodes (or none) and of their undisturbed twins.
 
-    A disturbance that is only seen is judged on the twins' states, with and without it in view; then no disturbed
-    episode is needed for the frames.
+    A disturbance that is only seen, or placed, is judged on the twins' states, with and without it in view; then no
+    disturbed episode is needed for the frames.
     """
     settings = {
         "cell": str(cell),
@@ -170,7 +174,8 @@ def signals_job(
         "signals": list(task.signals),
         "shown_chunks": SHOWN_CHUNKS,
     }
-    code = ["safeswitch.scoring.signal_quality", "safeswitch.handover.table", "safeswitch.handover.shown"]
+    scoring = ["safeswitch.scoring.signal_quality", "safeswitch.scoring.sightings"]
+    code = [*scoring, "safeswitch.handover.table", "safeswitch.handover.shown"]
     key = store.key("signals", settings, [*trained.keys, *disturbed, *twins], code)
     arguments = (str(store.root), task, cell, trained, disturbed, twins)
     return Job("signals", f"{cell} learner {trained.seed}", key, _score_signals, arguments)
@@ -193,17 +198,18 @@ def _score_signals(
         about = (disturbed.onset, disturbed.t_first, disturbed.learner_success)
         for signal in task.signals:
             by_signal[signal] = signal_quality(disturbed.signals[signal], twins.signals[signal], *about)
-    if only_seen(cell):
+    about_cell = {"task": cell.task, "disturbance": cell.label, "severity": cell.severity, "learner": trained.seed}
+    if can_be_shown(cell):
         env = make_env(task, cell)
         states = recorded_table(store, twin_keys[:SHOWN_CHUNKS])
-        shown, visible = shown_traces(env, trained.learner(task), trained.signals(task), states)
+        shown = shown_traces(env, trained.learner(task), trained.signals(task), states)
         env.close()
+        if np.isfinite(shown.distance).any():
+            seen = sightings(shown, dict(states.signals), task.signals).assign(**about_cell)
+            save_frame(folder / "sightings.npz", seen)
         for signal in task.signals:
-            frames = frame_quality(shown[signal], states.signals[signal], visible)
+            frames = frame_quality(shown.traces[signal], states.signals[signal], shown.judged)
             before = by_signal.get(signal, frames)
             by_signal[signal] = replace(frames, episode_auroc=before.episode_auroc)
     rows = [{"signal": signal, **asdict(quality)} for signal, quality in by_signal.items()]
-    frame = pd.DataFrame(rows).assign(
-        task=cell.task, disturbance=cell.label, severity=cell.severity, learner=trained.seed
-    )
-    save_frame(folder / "signals.npz", frame)
+    save_frame(folder / "signals.npz", pd.DataFrame(rows).assign(**about_cell))

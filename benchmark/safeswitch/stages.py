@@ -257,11 +257,19 @@ def only_seen(cell: Cell) -> bool:
     return cell.tag != "none" and DISTURBANCES[cell.disturbance].only_seen
 
 
+def can_be_shown(cell: Cell) -> bool:
+    """Whether undisturbed states can be seen with the disturbance: nothing else changes, or it stands ahead of them."""
+    from safeswitch.tasks.disturbances import DISTURBANCES  # imports mujoco
+
+    return cell.tag != "none" and (only_seen(cell) or DISTURBANCES[cell.disturbance].placed)
+
+
 def concat(frames: list[pd.DataFrame]) -> pd.DataFrame:
     """Frames below one another."""
     return pd.concat(frames, ignore_index=True)
 
 
 def load_rows(store: Store, jobs: list[Job], name: str) -> pd.DataFrame:
-    """The data frames that jobs wrote as `name`, put together."""
-    return concat([load_frame(store.folder(job.key) / name) for job in jobs])
+    """The data frames that jobs wrote as `name`, put together; an empty one if none of them did."""
+    files = [path for job in jobs if (path := store.folder(job.key) / name).exists()]
+    return concat([load_frame(path) for path in files]) if files else pd.DataFrame()

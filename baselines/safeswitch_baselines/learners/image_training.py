@@ -175,7 +175,8 @@ def fit(
 ) -> History:
     """Train `model` in place on the episodes `training`; `held_out` are for validation and may be empty."""
     place = next(model.parameters()).device
-    encoders = [Encoder(encoding, config.frames, max(config.batch_size, EVALUATION_BATCH), place, config.excess_gain) for _ in range(2)]
+    most = max(config.batch_size, EVALUATION_BATCH)
+    encoders = [Encoder(encoding, config.frames, most, place, config.excess_gain) for _ in range(2)]
     layout = config.layout(*encoding.observation_shape[:2])
     bits = np.random.PCG64DXSM(seed_sequence(seed, "training-masks"))
     optimiser = make_optimiser(model, config)

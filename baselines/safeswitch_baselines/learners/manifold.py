@@ -1,14 +1,14 @@
-"""What is new in an image: the part of it that lies off the subspace of the training images, beyond the size seen there.
+"""What is new in an image: the part of it off the subspace of the training images, beyond the size seen there.
 
 The images of one scene lie near a subspace of few dimensions, their first principal components: how a border moves when
 the car turns is in them, and what no training image shows is not. With z a standardised image at half the resolution,
 
     r = z - V' V z,    excess = gain * sign(r) * max(|r| / q - 1, 0)
 
-where q is a high quantile of |r| of each number over the training images. In training the excess is nearly always 0, so that
-whatever reads it keeps its random initial weights; where something new stands it is large, also in front of pixels that
-vary much in training, for which standardisation alone is blind. There the network's answer is that of its prior, as
-with randomized prior functions (Osband et al. 2018, arXiv 1806.03335), and its posterior samples disagree.
+where q is a high quantile of |r| of each number over the training images. In training the excess is nearly always 0, so
+that whatever reads it keeps its random initial weights; where something new stands it is large, also in front of pixels
+that vary much in training, for which standardisation alone is blind. There the network's answer is that of its prior,
+as with randomized prior functions (Osband et al. 2018, arXiv 1806.03335), and its posterior samples disagree.
 """
 
 from __future__ import annotations

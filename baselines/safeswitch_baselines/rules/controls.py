@@ -115,7 +115,8 @@ class PeriodicControl(PlainMethod):
         """Burst length to the nearest step."""
         share, reference = reference_share(calibration)
         burst = round(share * PERIOD)
-        return Calibrated(PeriodicRule(burst), float(burst), reference.tuning_episodes, reference.expert_queries)
+        cost = (reference.tuning_episodes, reference.expert_queries)
+        return Calibrated(PeriodicRule(burst), float(burst), *cost, reads=())
 
 
 class _Shuffled:

@@ -72,7 +72,7 @@ class RiskCritic:
 def _regressors(panel: Panel, names: tuple[str, ...]) -> tuple[Array, Bools]:
     """(E, T, n) regressors, and (E, T) where they are known."""
     traces = [panel.signal(name) for name in names]
-    known = ~np.isnan(np.stack(traces)).any(axis=0)
+    known: Bools = np.isfinite(np.stack(traces).sum(axis=0))
     time = np.broadcast_to(np.arange(panel.table.horizon) / panel.table.horizon, known.shape)
     logs = [np.log(np.maximum(np.where(known, trace, 1.0), SMALLEST)) for trace in traces]
     return np.stack([*logs, time], axis=-1), known

@@ -160,7 +160,7 @@ def csv_text(frame: pd.DataFrame) -> str:
 
 def write_csv(frame: pd.DataFrame, path: Path) -> Path:
     """Write leaderboard, signals or comparisons sorted by key; the file is there completely or not at all."""
-    key = [name for name in (*KEY, "calibrated_on", "signal", "reference", "learner") if name in frame]
+    key = [name for name in (*KEY, "calibrated_on", "kind", "signal", "reference", "learner") if name in frame]
     write_text(path, csv_text(frame.sort_values(key, kind="stable")))
     return path
 

@@ -129,6 +129,10 @@ class TaskEnv(gym.Env[NDArray[Any], NDArray[Any]]):
         """Whether the placed `disturbance` is in view in the current state."""
         raise NotImplementedError
 
+    def distance_ahead(self) -> float:
+        """Distance to what a placed disturbance has put in the way [m], negative behind it; NaN without one."""
+        return math.nan
+
     def _actuator(self) -> Callable[[Array], None] | None:
         """Makes the controls from an action (nu,); None where the action is the controls."""
         return None

@@ -55,6 +55,9 @@ class Disturbance:
     only_seen: ClassVar[bool] = False
     placed: ClassVar[bool] = False
 
+    drawn: str = ""
+    """Which of its kinds this episode has; empty for a disturbance of one kind."""
+
     def __init__(self, severity: int) -> None:
         self.severity = check_severity(severity)
         self.value = self.levels[self.severity - 1]

@@ -285,6 +285,13 @@ class RallyCarEnv(TaskEnv):
         x, y, *_ = self._qpos
         return self.disturbance.grip(corners(x, y, yaw_of(self._qpos), (-REAR, FRONT, 0.5 * GAUGE)))
 
+    def distance_ahead(self) -> float:
+        """From the front bumper to the middle of what is placed, along the track [m]; negative behind it."""
+        if not isinstance(self.disturbance, Placed):
+            return math.nan
+        s, _ = self.track.project(float(self._qpos[0]), float(self._qpos[1]))
+        return math.remainder(self.disturbance.s - s, self.track.length) - FOOTPRINT[1]
+
     def _watcher(self) -> Callable[[], None] | None:
         self._touched = False
         placed = self.disturbance

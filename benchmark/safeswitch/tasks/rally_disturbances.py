@@ -57,6 +57,7 @@ class Placed(RallyDisturbance):
     def reset(self, rng: np.random.Generator, horizon: int) -> None:
         """Draw the body, its turn, its colour and its lateral offset."""
         self.body = self.bodies[int(rng.integers(len(self.bodies)))]
+        self.drawn = self.body.partition("_")[2]
         self._turn = rng.uniform(-math.pi, math.pi)
         self._colour = self._draw_colour(rng)
         self.lateral = self._draw_lateral(rng)

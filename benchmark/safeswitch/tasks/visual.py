@@ -74,7 +74,8 @@ class Object(Visual):
     def reset(self, rng: np.random.Generator, horizon: int) -> None:
         """Draw the object."""
         kinds = list(self.KINDS)
-        self._props = self.KINDS[kinds[int(rng.integers(len(kinds)))]]
+        self.drawn = kinds[int(rng.integers(len(kinds)))]
+        self._props = self.KINDS[self.drawn]
         self._size = self.value * rng.uniform(self.SMALLEST, 1.0)
         self._colour = self._draw_colour(rng)
         self._turn = rng.uniform(-math.pi / 2, math.pi / 2)
