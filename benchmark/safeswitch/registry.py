@@ -11,7 +11,6 @@ from __future__ import annotations
 import importlib
 import inspect
 import re
-from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, Any, Literal
@@ -113,32 +112,22 @@ def make_method(method_id: str) -> Method:
     return ReadyRule(method_id, made)
 
 
-@dataclass(frozen=True)
 class ReadyRule:
     """The method of a bare switch rule: nothing is calibrated.
 
     Attributes:
         id: as on the command line.
         rule: the rule, which may say `latched`, `needs` and `reads` as a method does.
+        needs: what the rule says that it needs.
+        latched: whether it never gives control back: True unless it says otherwise.
+        reads: ids of the signals that it looks at.
     """
 
-    id: str
-    rule: SwitchRule
-
-    @property
-    def needs(self) -> frozenset[str]:
-        """What the rule says that it needs."""
-        return frozenset(getattr(self.rule, "needs", ()))
-
-    @property
-    def latched(self) -> bool:
-        """Whether the rule never gives control back: True unless it says otherwise."""
-        return bool(getattr(self.rule, "latched", True))
-
-    @property
-    def reads(self) -> tuple[str, ...]:
-        """Ids of the signals that the rule looks at."""
-        return tuple(getattr(self.rule, "reads", ()))
+    def __init__(self, id_: str, rule: SwitchRule) -> None:
+        self.id, self.rule = id_, rule
+        self.needs: frozenset[str] = frozenset(getattr(rule, "needs", ()))
+        self.latched = bool(getattr(rule, "latched", True))
+        self.reads: tuple[str, ...] = tuple(getattr(rule, "reads", ()))
 
     def calibrate(self, calibration: Calibration) -> Calibrated:
         """The rule as it is."""
