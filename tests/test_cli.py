@@ -14,7 +14,10 @@ from safeswitch import cli, doctor, registry, suite
 from safeswitch.console import console
 from safeswitch.doctor import Check
 
-COMMANDS = ("bench", "demos", "train", "evaluate", "submit", "leaderboard", "verify", "gate", "list", "play", "doctor")
+COMMANDS = (
+    *("bench", "demos", "train", "evaluate", "submit", "leaderboard", "verify", "score", "compare", "reference"),
+    *("gate", "list", "play", "doctor"),
+)
 
 
 def run(capsys: Any, *arguments: str) -> tuple[int, str]:

@@ -35,6 +35,8 @@ PASSIVE = {
     "safeswitch.tasks.checks",  # errors alone
     "safeswitch.tasks.opengl",  # as rendering
     "safeswitch.tasks.rendering",  # pictures alone: an image task names it in its `modules`
+    "safeswitch.tasks.rally_disturbances",  # of the rally car alone, which names them in its `modules`
+    "safeswitch.tasks.rally_visual",  # as these
     "safeswitch.tasks.visual",  # as rendering: disturbances of what a camera sees
 }
 """Modules that a stage may use without depending on their content: no number of a result comes from them."""

@@ -299,8 +299,8 @@ def test_the_control_loop_arms_at_first_sight() -> None:
     env = make(STATE, disturbance="obstacle")
     rule = Never()
     episode = run_episode(env, Blind(env), [], rule, None, seed=0, arming="onset", record_snapshots=True)
-    assert 0 < episode.onset < 120 and rule.armed == episode.arming_step == episode.onset
-    assert not episode.success and episode.length < 120  # it drove into the obstacle
+    assert 0 < episode.onset < episode.horizon and rule.armed == episode.arming_step == episode.onset
+    assert not episode.success and episode.length < episode.horizon  # it drove into the obstacle
     # An obstacle that never comes into view: the episode is disturbed, and never armed.
     short = make(STATE, disturbance="obstacle", horizon=int(episode.onset) - 1)
     episode = run_episode(short, Blind(short), [], rule, None, seed=0, arming="onset")

@@ -55,7 +55,8 @@ def evaluation(root: Path, arming: Arming = "start", learners: int = 1, episodes
     run.learners = []  # type: ignore[misc]  # nothing is trained
     frames, rng = [], np.random.default_rng(5)
     for learner in range(learners):
-        halves = [table(profile.seeds_of("test"), kind, run.task_info.horizon, rng) for kind in (True, False)]
+        seeds = profile.seeds_of(TASK, cell, "test")
+        halves = [table(seeds, kind, run.task_info.horizon, rng) for kind in (True, False)]
         panel = Panel(concatenate(halves) if arming == "start" else halves[0], arming)
         for name in METHODS:
             calibrated = make_method(name).calibrate(Calibration(panel, halves[1], seed=learner))

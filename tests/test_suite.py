@@ -46,11 +46,12 @@ def test_names_are_unique() -> None:
 @pytest.mark.parametrize("cell", CELLS, ids=str)
 def test_every_cell_is_of_its_task(cell: Cell) -> None:
     task = suite.task(cell.task)
+    track = {"track": cell.track} if cell.track else {}
     if cell.tag == "none":
-        assert (cell.disturbance, cell.severity, cell.env_kwargs) == ("none", 0, {})
+        assert (cell.disturbance, cell.severity, cell.env_kwargs) == ("none", 0, track)
     else:
         assert cell.disturbance in offered(task.name) and cell.severity in SEVERITIES
-        assert cell.env_kwargs == {"disturbance": cell.disturbance, "severity": cell.severity}
+        assert cell.env_kwargs == {"disturbance": cell.disturbance, "severity": cell.severity, **track}
     env = stages.make_env(task, cell)
     env.reset(seed=0)
     assert (env.onset is None) == (cell.tag == "none")

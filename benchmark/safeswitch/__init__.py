@@ -22,6 +22,13 @@ ENTRY_POINTS: dict[str, str] = {
 }
 """Environment id -> where its class is, imported when the environment is made."""
 
+HANDOVER_TASKS: dict[str, str] = {
+    "SafeSwitch/CartPoleHandover-v0": "cart-pole",
+    "SafeSwitch/CartPoleImageHandover-v0": "cart-pole-image",
+    "SafeSwitch/RallyCarImageHandover-v0": "rally-car-image",
+}
+"""Environment id of the switching problem -> the task whose handover tables it is served from."""
+
 
 def register() -> None:
     """Register every SafeSwitch id that Gymnasium does not know yet.
@@ -32,6 +39,14 @@ def register() -> None:
     for env_id, entry_point in ENTRY_POINTS.items():
         if env_id not in gym.registry:
             gym.register(id=env_id, entry_point=entry_point)
+    for env_id, task in HANDOVER_TASKS.items():
+        if env_id not in gym.registry:
+            gym.register(
+                id=env_id,
+                entry_point="safeswitch.handover.served:make",
+                vector_entry_point="safeswitch.handover.served:make_vector",
+                kwargs={"task": task},
+            )
 
 
 register()

@@ -1,60 +1,19 @@
-"""The command line: bench, demos, train, evaluate, submit, leaderboard, verify, gate, expert-report and others."""
+"""When should a learned controller hand control back to an expert? Run, score and compare switch rules."""
 
 from __future__ import annotations
 
-import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import tyro
 from rich.markup import escape
 from rich.table import Table
 
-from safeswitch import registry, suite
+from safeswitch import commands, registry, submit_commands, suite
 from safeswitch.console import console
-
-if TYPE_CHECKING:
-    from safeswitch.evaluation import Evaluation
-    from safeswitch.pipeline import Run
-
-
-@dataclass
-class Common:
-    """Options that every command on runs shares.
-
-    Attributes:
-        profile: how much is run: smoke, standard or full.
-        task: one task only; all tasks where it is left out.
-        jobs: processes at a time (default: the number of cores); results do not depend on it.
-        store: folder of finished work (default: .safeswitch/store in the checkout, or $SAFESWITCH_STORE).
-        quiet: print errors only.
-    """
-
-    profile: str = "standard"
-    task: str | None = None
-    jobs: int | None = None
-    store: Path | None = None
-    quiet: bool = False
-
-    def runs(self) -> list:
-        """One run per task."""
-        from safeswitch.pipeline import Run
-        from safeswitch.store import Store
-
-        console.quiet = self.quiet
-        if self.jobs is not None and self.jobs < 1:
-            raise ValueError(f"--jobs must be at least 1, got {self.jobs}")
-        tasks = [suite.task(self.task)] if self.task else list(suite.TASKS.values())
-        return [Run(task, suite.profile(self.profile), Store(self.store), self.workers) for task in tasks]
-
-    @property
-    def workers(self) -> int:
-        """Processes at a time."""
-        from joblib import cpu_count
-
-        return self.jobs or cpu_count()
+from safeswitch.options import Common, Contestant
 
 
 @dataclass
@@ -123,35 +82,6 @@ class Train:
 
 
 @dataclass
-class Contestant:
-    """Who is scored, and where.
-
-    Attributes:
-        learner: registered learner or package.module:factory (default: the task's own).
-        rule: id such as cem@total; rule and signal may each be package.module:factory.
-        signals: further signals to record; those that the rule says it reads are recorded anyway.
-        disturbance: disturbance of the cell (default: the paper's).
-        severity: 1 to 5.
-        protocol: onset or start.
-    """
-
-    learner: str | None = None
-    rule: Annotated[str, tyro.conf.arg(aliases=["--method"])] = "cem@total"
-    signals: tuple[str, ...] = ()
-    disturbance: str | None = None
-    severity: int = 3
-    protocol: str = "onset"
-
-    def evaluate(self, run: Run) -> Evaluation:
-        """Score it in a run."""
-        from safeswitch.evaluation import evaluate
-
-        return evaluate(
-            run, self.rule, self.disturbance, self.severity, self.protocol, self.learner, tuple(self.signals)
-        )
-
-
-@dataclass
 class Evaluate:
     """Score one learner and rule, the suite's or your own, in one cell."""
 
@@ -168,111 +98,6 @@ class Evaluate:
             for name, value in found.scores.items():
                 table.add_row(str(name), f"{value:.4g}" if isinstance(value, float) else str(value))
             console.print(table)
-
-
-@dataclass
-class Submit:
-    """Score one learner and rule, and write a submission to the leaderboard: one JSON file. See docs/submit.md.
-
-    Attributes:
-        name: of the entry, as the table shows it.
-        authors: who submits it.
-        url: where the code of learner and rule is.
-        description: one or two sentences.
-        results: folder of the leaderboard; the file goes into its folder submissions (default: results/).
-    """
-
-    common: tyro.conf.OmitArgPrefixes[Common]
-    contestant: tyro.conf.OmitArgPrefixes[Contestant]
-    name: str
-    authors: str
-    url: str = ""
-    description: str = ""
-    results: Path | None = None
-
-    def run(self) -> None:
-        """Do it."""
-        from safeswitch import submissions
-        from safeswitch.publish import default_folder
-
-        if not self.common.task:
-            raise ValueError("a submission is about one task: add --task, for example --task cart-pole")
-        (run,) = self.common.runs()
-        folder = (self.results or default_folder("full")) / "submissions"
-        about = (self.name, self.authors, self.url, self.description)
-        found = self.contestant.evaluate(run)
-        path = submissions.write(found, folder, *about)
-        score = f"return {found.scores['return_mean']:.3f}, success {found.scores['success']:.3f}"
-        console.print(f"{self.name} in {found.cell} ({found.protocol}): {score}; submission in [cyan]{path}[/]")
-
-
-@dataclass
-class Leaderboard:
-    """Check every submission and write the table of those that hold beside the leaderboard. Exit code 1: some do not.
-
-    Attributes:
-        results: folder of the leaderboard (default: results/).
-        minimum_episodes: a submission with fewer test episodes a learner is refused.
-    """
-
-    results: Path | None = None
-    minimum_episodes: int = 40
-
-    def run(self) -> int:
-        """Do it; 1 if a submission was refused."""
-        from safeswitch.publish import default_folder
-        from safeswitch.verification import merge
-
-        folder = self.results or default_folder("full")
-        table, refused = merge(folder, self.minimum_episodes)
-        for name, reason in refused.items():
-            console.print(f"[bold red]refused[/] {escape(name)}: {escape(reason)}")
-        console.print(f"{len(table)} merged, {len(refused)} refused; table in [cyan]{folder / 'submissions.md'}[/]")
-        return 1 if refused else 0
-
-
-@dataclass
-class Verify:
-    """Run a submission again on kept-back episodes, and tell whether it agrees (maintainers). Exit code 1: it does not.
-
-    The code of learner and rule must be importable. It is somebody else's: run it in a container without a network.
-
-    Attributes:
-        submission: the JSON file.
-        secret: decides the kept-back episodes (default: $SAFESWITCH_SECRET).
-        jobs: processes at a time (default: the number of cores).
-        store: folder of finished work.
-    """
-
-    submission: tyro.conf.Positional[Path]
-    secret: str | None = None
-    jobs: int | None = None
-    store: Path | None = None
-
-    def run(self) -> int:
-        """Do it; 1 if the rerun does not agree."""
-        from safeswitch.submissions import read
-        from safeswitch.verification import commitment, verify
-
-        secret = self.secret or os.environ.get("SAFESWITCH_SECRET", "")
-        commitment(secret)  # refuses one that is too short before anything is run
-        if not self.submission.is_file():
-            raise ValueError(f"there is no submission {self.submission}")
-        submission = read(self.submission)
-        content = submission.content
-        (run,) = Common(content["profile"]["name"], content["cell"]["task"], self.jobs, self.store).runs()
-        record = verify(run, submission, secret)
-        table = Table("score", "reported", "on kept-back episodes", "intervals overlap", title=content["name"])
-        for name, agrees in record["agreement"].items():
-            prefix = name.removesuffix("_mean")
-            shown = [
-                f"{scores[name]:.3f} [{scores[f'{prefix}_lo']:.3f}, {scores[f'{prefix}_hi']:.3f}]"
-                for scores in (submission.scores, record["scores"])
-            ]
-            table.add_row(name, *shown, "yes" if agrees else "NO")
-        console.print(table)
-        console.print("verified" if record["agrees"] else "[bold red]not confirmed[/]")
-        return 0 if record["agrees"] else 1
 
 
 @dataclass
@@ -392,9 +217,12 @@ Command = (
     | Annotated[Demos, tyro.conf.subcommand("demos")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-    | Annotated[Submit, tyro.conf.subcommand("submit")]
-    | Annotated[Leaderboard, tyro.conf.subcommand("leaderboard")]
-    | Annotated[Verify, tyro.conf.subcommand("verify")]
+    | Annotated[submit_commands.Submit, tyro.conf.subcommand("submit")]
+    | Annotated[submit_commands.Leaderboard, tyro.conf.subcommand("leaderboard")]
+    | Annotated[submit_commands.Verify, tyro.conf.subcommand("verify")]
+    | Annotated[commands.Score, tyro.conf.subcommand("score")]
+    | Annotated[commands.Compare, tyro.conf.subcommand("compare")]
+    | Annotated[commands.Reference, tyro.conf.subcommand("reference")]
     | Annotated[Gate, tyro.conf.subcommand("gate")]
     | Annotated[ExpertReport, tyro.conf.subcommand("expert-report")]
     | Annotated[List, tyro.conf.subcommand("list")]

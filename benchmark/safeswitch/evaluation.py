@@ -125,7 +125,7 @@ def score_episodes(run: Run, method_id: str, cell: Cell, arming: Arming) -> pd.D
                 check_rule(name, method, calibrated, test)
                 rows = latched_rows(test, calibrated)
             else:
-                rows = scoring_stages.plain_rows(run.task, cell, run.trained[seed], test, method, calibrated)
+                rows = scoring_stages.plain_rows(run.task, cell, run.trained[seed], test, method, calibrated.rule)
             frames.append(scoring_stages.labelled(rows, cell, arming, name, seed, calibrated, ""))
     return stages.concat(frames)
 

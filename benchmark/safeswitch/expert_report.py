@@ -26,6 +26,7 @@ from safeswitch.protocols import Expert
 from safeswitch.scoring.stats import wilson
 from safeswitch.scoring.style import CYCLE, DASHES, sheet
 from safeswitch.suite import episode_seeds
+from safeswitch.tasks.car_geometry import FOOTPRINT
 from safeswitch.tasks.track import TRACKS
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ ENV_IDS = {"rally-car-image": "SafeSwitch/RallyCarImage-v0", "rally-car": "SafeS
 SPEEDS = (3.0, 4.0, 5.0)  # [m/s]
 DISTANCES = (1.0, 1.25, 1.5, 2.0, 3.0, 4.0)  # from the front bumper to the obstacle's centre [m]
 SEVERITY = 3
-BUMPER = 0.505  # ahead of the centre of mass [m]
+BUMPER = FOOTPRINT[1]  # ahead of the centre of mass [m]
 MARKERS = ("o", "s", "^", "D", "v")
 
 

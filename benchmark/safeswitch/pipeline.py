@@ -136,7 +136,7 @@ class Run:
                 splits: tuple[Split, ...] = ("test", "calibrate") if cell in calibrated_on else ("test",)
                 for split in splits:
                     twins = chunks.get((trained.seed, task.undisturbed(cell), split), ())
-                    seeds = self.profile.seeds_of(split)
+                    seeds = self.profile.seeds_of(task, cell, split)
                     jobs = table_jobs(self.store, task, cell, split, seeds, trained, twins)
                     chunks[trained.seed, cell, split] = jobs
                     stage += jobs
@@ -148,7 +148,7 @@ class Run:
                 keys[seed, task.undisturbed(task.calibrated_on(cell)), "calibrate"],
                 keys[seed, cell, "test"],
                 keys[seed, task.undisturbed(cell), "test"],
-                tuple((other, keys[seed, other, "calibrate"]) for other in others(cell, cells)),
+                tuple((other, keys[seed, other, "calibrate"]) for other in others(cell, cells) if not task.costly),
             )
             for seed in range(len(self.learners))
             for cell in cells
@@ -184,7 +184,7 @@ class Run:
                 cell,
                 self.trained[seed],
                 keys,
-                tables[seed, str(self.task.undisturbed(cell))].test[: None if (seed, cell) in test else chunks],
+                tables[seed, str(self.task.undisturbed(cell))].test[: len(keys) or chunks],
             )
             for (seed, cell), keys in {**test, **further}.items()
         ]
@@ -194,13 +194,14 @@ class Run:
     def _further_tables(self) -> dict[tuple[int, Cell], tuple[str, ...]]:
         """Tables of the cells in which only signals are scored; none where only the picture is disturbed."""
         profile = self.profile
-        seeds = profile.seeds_of("test")[: profile.signal_episodes]
+        seeds = profile.seeds_of(self.task, self.task.none_cell, "test")[: profile.signal_episodes]
         chunks = {
             (trained.seed, cell): []
             if only_seen(cell)
             else table_jobs(self.store, self.task, cell, "test", seeds, trained)
             for trained in self.trained
             for cell in self.task.severities(*profile.signal_severities)
+            if not self.task.costly
         }
         if chunks:
             self.finish("further severities", [job for jobs in chunks.values() for job in jobs])
@@ -246,7 +247,7 @@ class Run:
         return Run(task, profile, self.store, self.workers)
 
     def _gives_back(self, cell: object) -> bool:
-        return cell in self.task.cells[: self.profile.give_back_cells]
+        return cell in self.task.cells[: self.profile.give_back_cells] and not self.task.costly
 
     def finish(self, stage: str, jobs: Iterable[Job]) -> None:
         """Run the jobs that the store does not hold yet, `workers` at a time, with a progress bar."""

@@ -193,8 +193,8 @@ class SwitchRule(Protocol):
     """Decides the driver of each step from the signals, and from nothing else.
 
     A class or function that makes one is enough for `--rule package.module:factory`. Three attributes are then looked
-    at, with these defaults: `reads = ()`, ids of the signals that the rule looks at besides the one behind `@`;
-    `latched = True`, whether it never gives control back; `needs = ()`, as in `Method`.
+    at, with these defaults: `reads = ()`, ids of the signals that the rule looks at (in plain episodes the others are
+    not computed); `latched = True`, whether it never gives control back; `needs = ()`, as in `Method`.
     """
 
     def reset(self, seed: int) -> None:
@@ -229,7 +229,6 @@ class Calibrated:
         tuning_episodes: episodes spent on calibration (candidates x episodes for searches).
         expert_queries: expert-driven steps spent on calibration.
         log: arrays worth keeping, such as every CEM sample (name -> array).
-        reads: signals that the rule looks at, None for all of them: plain episodes compute no others.
     """
 
     rule: Any
@@ -237,7 +236,6 @@ class Calibrated:
     tuning_episodes: int = 0
     expert_queries: int = 0
     log: Mapping[str, NDArray[Any]] = field(default_factory=dict)
-    reads: tuple[str, ...] | None = None
 
 
 @runtime_checkable

@@ -11,13 +11,18 @@ import shutil
 import subprocess
 import time
 from importlib.metadata import PackageNotFoundError, version
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
+from rich.markup import escape
 
 from safeswitch import pictures, registry
+from safeswitch.console import console
 from safeswitch.files import load_json, save_frame, save_json
+from safeswitch.handover.published import write_table
+from safeswitch.handover.table import HandoverTable
 from safeswitch.scoring.comparisons import paired_comparisons
 from safeswitch.scoring.leaderboard import leaderboard, merge_task_rows, read_csv, write_csv
 from safeswitch.scoring.left_out import left_out_lines, left_out_table
@@ -26,9 +31,9 @@ from safeswitch.scoring.metrics import TaskInfo
 from safeswitch.scoring.sightings import sighting_table
 from safeswitch.scoring.signal_quality import signal_table
 from safeswitch.scoring_stages import calibration_of, protocols_of
-from safeswitch.stages import Job, load_rows, source_of
+from safeswitch.stages import Job, complete_job, load_rows, source_of
 from safeswitch.store import Store
-from safeswitch.suite import SPLIT_SIZE, SPLITS, TASKS, Cell, Task, methods
+from safeswitch.suite import SPLIT_SIZE, SPLITS, TASKS, Cell, Split, Task, methods, without_extra
 
 if TYPE_CHECKING:
     from safeswitch.pipeline import Run
@@ -50,6 +55,8 @@ def publish(run: Run, folder: Path | None = None) -> Path:
     folder = (folder or default_folder(run.profile.name)).absolute()
     started = time.time()
     commit = git_commit()  # before anything is written into the checkout
+    for reason in without_extra().values():
+        console.print(f"[yellow]{escape(reason)}[/]")
     scores, spread, figures = run.scores, run.spread, run.figures
     folder.mkdir(parents=True, exist_ok=True)
     for name in TABLES:
@@ -157,13 +164,19 @@ def figures_job(store: Store, task: Task, trained: Trained, episodes: Job, table
 
 
 def _write_tables(run: Run, folder: Path) -> None:
-    """Tables of the first three cells: signals and known outcomes, to score latched rules without MuJoCo."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for job in run.episodes:
-        cell, trained = job.arguments[2], job.arguments[3]
-        if cell in run.task.cells[:3]:
-            target = folder / f"{cell.label}-{cell.severity}-learner{trained.seed}.npz"
-            shutil.copyfile(run.store.folder(job.key) / "test.npz", target)
+    """Complete tables of the first three cells, both splits apart, to score latched rules without MuJoCo."""
+    jobs: dict[tuple[Cell, Split, int], Job] = {}
+    for seed, cell in product(range(run.profile.learners), run.task.cells[:3]):
+        tables = run.tables[seed, str(cell)]
+        keys: dict[Split, tuple[str, ...]] = {"test": tables.test}
+        if cell in (run.task.paper_cell, run.task.none_cell):  # thresholds of the others come from these
+            keys["calibrate"] = tables.calibrate_nominal if cell == run.task.none_cell else tables.calibrate
+        for split, recorded in keys.items():
+            jobs[cell, split, seed] = complete_job(run.store, run.task, cell, recorded)
+    run.finish("published tables", jobs.values())
+    shutil.rmtree(folder, ignore_errors=True)
+    for (cell, split, seed), job in jobs.items():
+        write_table(HandoverTable.load(run.store.folder(job.key) / "table.npz"), folder, cell, split, seed)
 
 
 def _merge(target: Path, rows: pd.DataFrame) -> None:
@@ -184,7 +197,7 @@ def _manifest(run: Run, folder: Path, commit: str, seconds: float) -> dict[str, 
         "commit": commit,
         "profile": run.profile.name,
         "made": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        "versions": {"python": platform.python_version(), **{name: _version(name) for name in LIBRARIES}},
+        "versions": {"python": platform.python_version(), **{name: installed(name) for name in LIBRARIES}},
         "hardware": {"machine": platform.machine(), "processor": _processor(), "workers": run.workers},
         "learner_seeds": list(range(run.profile.learners)),
         "episodes": {"calibrate": run.profile.calibrate, "test": run.profile.test},
@@ -223,7 +236,8 @@ def _processor() -> str:
         return platform.processor()
 
 
-def _version(distribution: str) -> str:
+def installed(distribution: str) -> str:
+    """Version of an installed distribution."""
     try:
         return version(distribution)
     except PackageNotFoundError:

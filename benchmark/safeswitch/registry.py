@@ -13,6 +13,7 @@ import inspect
 import re
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from safeswitch.names import unknown
@@ -58,6 +59,14 @@ def find(kind: Kind, name: str) -> Any:
     if name not in _entries(kind):
         raise unknown(kind, name, names(kind))
     return _entries(kind)[name].load()
+
+
+def package_folder(kind: Kind, name: str) -> Path:
+    """Folder of the top-level package that registers `name`, found without importing the object itself."""
+    if name not in _entries(kind):
+        raise unknown(kind, name, names(kind))
+    package = importlib.import_module(_entries(kind)[name].module.partition(".")[0])
+    return Path(next(iter(package.__path__)))
 
 
 def make_signal(signal_id: str, context: SignalContext | None = None) -> Signal:

@@ -16,16 +16,17 @@ from safeswitch import registry
 from safeswitch.files import save_arrays, save_frame
 from safeswitch.handover.episode import run_episode
 from safeswitch.handover.panel import Calibration, Panel
+from safeswitch.handover.published import armings_of, panel_of
 from safeswitch.handover.shown import shown_traces
-from safeswitch.handover.table import HandoverTable, concatenate
-from safeswitch.protocols import ARMINGS, Arming, Calibrated
+from safeswitch.handover.table import HandoverTable
+from safeswitch.protocols import Arming
 from safeswitch.scoring.metrics import OTHERS
 from safeswitch.scoring.rows import episode_rows, latched_rows
 from safeswitch.scoring.sightings import sightings
 from safeswitch.scoring.signal_quality import SignalQuality, frame_quality, signal_quality
 from safeswitch.stages import CellTables, Job, can_be_shown, concat, load_table, make_env, recorded_table, source_of
-from safeswitch.store import Store
-from safeswitch.suite import Cell, Task, methods
+from safeswitch.store import LIBRARIES, Store
+from safeswitch.suite import OPTIONAL, Cell, Task, methods
 from safeswitch.trained import Trained
 
 if TYPE_CHECKING:
@@ -41,7 +42,8 @@ def episodes_job(store: Store, task: Task, cell: Cell, trained: Trained, tables:
     settings = {"cell": str(cell), "learner_seed": trained.seed, "methods": list(ids), "give_back": give_back}
     rules = {source_of("method", name.partition("@")[0]) for name in ids}
     code = ["safeswitch.handover.panel", "safeswitch.scoring.rows", *sorted(rules)]
-    key = store.key("episodes", settings, [*trained.keys, *tables.keys], code)
+    optional = [module.replace("_", "-") for name, (module, _) in OPTIONAL.items() if name in ids]
+    key = store.key("episodes", settings, [*trained.keys, *tables.keys], code, [*LIBRARIES, *optional])
     arguments = (str(store.root), task, cell, trained, tables, give_back)
     return Job("episodes", f"{cell} learner {trained.seed}", key, _score_episodes, arguments)
 
@@ -72,13 +74,13 @@ def _score_episodes(
             if method.latched:
                 rows = latched_rows(test, calibrated)
             else:
-                rows = plain_rows(task, cell, trained, test, method, calibrated)
+                rows = plain_rows(task, cell, trained, test, method, calibrated.rule)
             frames.append(labelled(rows, cell, protocol, method_id, trained.seed, calibrated, own))
             logs.update({f"{protocol}|{method_id}|{name}": value for name, value in calibrated.log.items()})
         if others is not None:
             nominal = loaded["calibrate_nominal"]
             twins = nominal.take(np.tile(np.arange(len(nominal)), len(others) // len(nominal)))
-            left_out = Calibration(_panel(others, twins, cell, protocol), nominal, seed=trained.seed)
+            left_out = Calibration(panel_of(others, twins, protocol), nominal, seed=trained.seed)
             frames += _left_out_rows(task, cell, trained, test, left_out)
     save_frame(folder / "episodes.npz", concat(frames))
     save_arrays(folder / "logs.npz", **logs)
@@ -100,36 +102,29 @@ def _left_out_rows(
 
 
 def protocols_of(cell: Cell) -> tuple[Arming, ...]:
-    """Armings under which a cell is scored: without a disturbance there is no onset."""
-    return ("start",) if cell.tag == "none" else ARMINGS
+    """Armings under which a cell is scored."""
+    return armings_of(cell.label)
 
 
 def test_panel(loaded: dict[str, HandoverTable], cell: Cell, protocol: Arming) -> Panel:
     """Test episodes of a cell under an arming."""
-    return _panel(loaded["test"], loaded["test_nominal"], cell, protocol)
+    nominal = None if cell.tag == "none" else loaded["test_nominal"]
+    return panel_of(loaded["test"], nominal, protocol)
 
 
 def calibration_of(
     loaded: dict[str, HandoverTable], task: Task, cell: Cell, protocol: Arming, seed: int
 ) -> Calibration:
     """Calibrate episodes of a cell under an arming."""
-    panel = _panel(loaded["calibrate"], loaded["calibrate_nominal"], task.calibrated_on(cell), protocol)
-    return Calibration(panel, loaded["calibrate_nominal"], seed=seed)
-
-
-def _panel(table: HandoverTable, nominal: HandoverTable, cell: Cell, protocol: Arming) -> Panel:
-    """Disturbed episodes, and under `start` their undisturbed twins beside them."""
-    if cell.tag == "none":
-        return Panel(nominal, protocol)
-    return Panel(concatenate([table, nominal]) if protocol == "start" else table, protocol)
+    nominal = loaded["calibrate_nominal"]
+    return Calibration(panel_of(loaded["calibrate"], nominal, protocol), nominal, seed=seed)
 
 
 def plain_rows(
-    task: Task, cell: Cell, trained: Trained, test: Panel, method: Method, calibrated: Calibrated
+    task: Task, cell: Cell, trained: Trained, test: Panel, method: Method, rule: Any
 ) -> pd.DataFrame:
     """Rules that give control back have no table: drive the same episodes."""
-    driver, rule, reads = trained.learner(task), calibrated.rule, calibrated.reads
-    signals = [signal for signal in trained.signals(task) if reads is None or signal.id in reads]
+    driver, signals = trained.learner(task), trained.signals(task, getattr(rule, "reads", None))
     envs = {True: make_env(task, cell), False: make_env(task, task.undisturbed(cell))}
     experts = {kind: env.make_expert() for kind, env in envs.items()}
     advisers = {kind: env.make_expert() if "expert-queries" in method.needs else None for kind, env in envs.items()}

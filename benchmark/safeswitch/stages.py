@@ -169,7 +169,7 @@ def table_jobs(
             "split": split,
             "seeds": chunk,
             "signals": list(task.signals),
-            "complete": cell.complete(split),
+            "complete": cell.complete(split, task.costly),
         }
         key = store.key("table", settings, [*trained.keys, *twin], code)
         label = f"{cell} {split} {first}-{first + len(chunk) - 1} (learner {trained.seed})"
@@ -191,7 +191,7 @@ def _tabulate(
     table = record_table(env, trained.learner(task), trained.signals(task), env.make_expert(), seeds)
     for twin in twins:
         table.share(HandoverTable.load(Path(twin) / "table.npz"))
-    if cell.complete(split):
+    if cell.complete(split, task.costly):
         table.complete()
     table.save(folder / "table.npz")
     env.close()
@@ -206,6 +206,18 @@ def load_table(store: Store, task: Task, cell: Cell, keys: tuple[str, ...]) -> H
     """The same with a simulator that resolves the outcomes still unknown."""
     env = make_env(task, cell)
     return recorded_table(store, keys).attach(env, env.make_expert())
+
+
+def complete_job(store: Store, task: Task, cell: Cell, recorded: tuple[str, ...]) -> Job:
+    """Chunks of a recorded table as one, with every outcome computed and without snapshots."""
+    code = [*PHYSICS, *task.code(), *HANDOVER]
+    key = store.key("complete-table", {"env": task.env_id, "cell": cell.env_kwargs}, recorded, code)
+    return Job("complete-table", str(cell), key, _complete, (str(store.root), task, cell, recorded))
+
+
+def _complete(folder: Path, root: str, task: Task, cell: Cell, recorded: tuple[str, ...]) -> None:
+    table = load_table(Store(Path(root)), task, cell, recorded)
+    table.complete().save(folder / "table.npz", snapshots=False)
 
 
 @dataclass(frozen=True)

@@ -122,8 +122,8 @@ def write(found: Evaluation, folder: Path, name: str, authors: str, url: str = "
         "profile": {
             "name": profile.name,
             "learners": profile.learners,
-            "calibrate": profile.calibrate,
-            "test": profile.test,
+            "calibrate": profile.episodes(task, cell, "calibrate"),
+            "test": profile.episodes(task, cell, "test"),
         },
         "scores": {key: value for key, value in found.scores.items() if key not in UNSCORED},
         "episodes": episodes,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
@@ -64,9 +65,9 @@ class Cell:
         """Whether thresholds are also calibrated on the other disturbances: severity 3 of what does harm."""
         return self.severity == 3 and self.tag in ("paper", "other")
 
-    def complete(self, split: Split) -> bool:
+    def complete(self, split: Split, costly: bool) -> bool:
         """Whether every outcome is computed in advance: tables that many rules, and cells, come back to."""
-        often = self.left_out and split == "calibrate"
+        often = self.left_out and split == "calibrate" and not costly
         return self.tag == "none" or (self.tag == "paper" and self.severity == 3) or often
 
     @property
@@ -95,6 +96,9 @@ class Task:
         literal: the learner as the paper describes it, where it is not the one above; it is reported beside it.
         literal_options: overrides of its configuration.
         others: most learners of other seeds that an ensemble asks beside its own; None for all of them.
+        costly: whether an outcome takes so long that a run must do without some: cells after the first three then have
+            half the episodes, signals are scored at the severities of the cells alone, and no cell has rows that leave
+            its disturbance out or rules that give control back.
     """
 
     name: str
@@ -111,6 +115,7 @@ class Task:
     literal: str = ""
     literal_options: Mapping[str, Any] = field(default_factory=dict, hash=False)
     others: int | None = None
+    costly: bool = False
 
     @property
     def paper_cell(self) -> Cell:
@@ -314,6 +319,7 @@ TASKS: dict[str, Task] = {
             "safeswitch.tasks.rally_car_config",
             "safeswitch.tasks.rally_car_image",
             "safeswitch.tasks.rally_disturbances",
+            "safeswitch.tasks.rally_visual",
             "safeswitch.tasks.rendering",
             "safeswitch.tasks.sight",
             "safeswitch.tasks.track",
@@ -323,6 +329,7 @@ TASKS: dict[str, Task] = {
         assets=("rally_car", "common"),
         showcase=("ensemble-mean3", "mahalanobis"),
         others=2,
+        costly=True,
     ),
 }
 
@@ -356,6 +363,8 @@ CONTROLS = ("random", "periodic", "shuffled@total", *(f"random-{share}" for shar
 QUANTILES = ("fixed-q95", "fixed-q99", "fixed-q999", "fixed-epmax95")
 VALUES = ("fixed-0.05@total", "fixed-0.1@total", "fixed-0.2@total", "fixed-0.4@total")
 CEM_VARIANTS = ("cem-literal@total", "cem-single@total", "cem-high@total", "cem-low@total")
+OPTIONAL: Mapping[str, tuple[str, str]] = {"ppo@signals": ("stable_baselines3", "rl")}
+"""Methods that need a library which is not installed by default: the module, and the extra that brings it."""
 MONITORS = ("conformal", "conformal-band", "patience")
 MATCHED = tuple(f"share-{share}" for share in SHARES)
 PER_SIGNAL = ("cem", "grid", "random-search", *QUANTILES, *MONITORS, *MATCHED, "best")
@@ -366,11 +375,21 @@ DOUBTS = ("ensemble", "epistemic")
 
 
 def methods(signals: tuple[str, ...]) -> tuple[str, ...]:
-    """Every method of the comparison on these signals."""
+    """Every method of the comparison on these signals; optional ones where their library is installed."""
     doubts = tuple(signal for signal in DOUBTS if signal in signals)[:1]
     give_back = [method for method in GIVE_BACK if method.partition("@")[2] in signals]
     give_back += _methods(doubts, ("ensemble-dagger", "thrifty"))
-    return (*BOUNDS, *CONTROLS, *VALUES, *CEM_VARIANTS, *OURS, *_methods(signals, PER_SIGNAL), *give_back)
+    optional = [method for method in OPTIONAL if method not in without_extra()]
+    return (*BOUNDS, *CONTROLS, *VALUES, *CEM_VARIANTS, *OURS, *_methods(signals, PER_SIGNAL), *give_back, *optional)
+
+
+def without_extra() -> dict[str, str]:
+    """Optional methods whose library is not installed, each with its remedy."""
+    return {
+        name: f"{name} is left out: it needs {module.replace('_', '-')}, pip install 'safeswitch[{extra}]'"
+        for name, (module, extra) in OPTIONAL.items()
+        if find_spec(module) is None
+    }
 
 
 @dataclass(frozen=True)
@@ -407,15 +426,20 @@ class Profile:
     literal_learners: int = 0
     kept_back: tuple[int, ...] = ()
 
-    def seeds_of(self, split: Split) -> list[int]:
-        """Seeds of the calibrate or the test episodes per (learner, cell)."""
+    def seeds_of(self, task: Task, cell: Cell, split: Split) -> list[int]:
+        """Seeds of the calibrate or the test episodes of a cell for each learner."""
         if split == "test" and self.kept_back:
             return list(self.kept_back)
-        return episode_seeds(split, {"calibrate": self.calibrate, "test": self.test}[split])
+        return episode_seeds(split, self.episodes(task, cell, split))
 
     def cells_of(self, task: Task) -> tuple[Cell, ...]:
         """The cells of `task` in this profile."""
         return task.cells[: self.cells]
+
+    def episodes(self, task: Task, cell: Cell, split: Split) -> int:
+        """Calibrate or test episodes of a cell for each learner."""
+        count = self.test if split == "test" else self.calibrate
+        return -(-count // 2) if task.costly and cell not in task.cells[:3] else count
 
 
 PROFILES: dict[str, Profile] = {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -83,11 +83,12 @@ class Trained:
         """The learner."""
         return self._load(task, self.key)
 
-    def signals(self, task: Task) -> list[Signal]:
-        """The task's signals for this learner, for one episode at a time."""
+    def signals(self, task: Task, chosen: Collection[str] | None = None) -> list[Signal]:
+        """The task's signals for this learner, or the `chosen` ones of them, for one episode at a time."""
         fits = {} if self.fits is None else _load_fits(str(Path(self.root) / self.fits))
         context = SignalContext(fits, tuple(self._load(task, key) for key in self.members))
-        return [registry.make_signal(signal, context) for signal in task.signals]
+        names = [signal for signal in task.signals if chosen is None or signal in chosen]
+        return [registry.make_signal(signal, context) for signal in names]
 
     def _load(self, task: Task, key: str) -> Any:
         return load_learner(task, str(Path(self.root) / key))

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -206,6 +206,7 @@ class VectorDwell(Dwell):
 
     def __init__(self, score: Score, lower: float):
         self.score = score
+        self.reads = score.baseline.names
         super().__init__(score.parameters.theta, lower)
 
     def arm(self, step: int) -> Driver:
@@ -276,7 +277,7 @@ class CEMVectorReturn(PlainMethod):
         score, learned = learn(calibration, Settings(), CEMVector.family)
         lower = float(np.quantile(_undisturbed_scores(score, calibration.nominal), LEVEL))
         rule = VectorDwell(score, lower)
-        return replace(learned, rule=rule, reads=score.baseline.names)
+        return Calibrated(rule, learned.threshold, learned.tuning_episodes, learned.expert_queries, learned.log)
 
 
 def _undisturbed_scores(score: Score, nominal: HandoverTable) -> Array:

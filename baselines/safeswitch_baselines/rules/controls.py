@@ -115,8 +115,7 @@ class PeriodicControl(PlainMethod):
         """Burst length to the nearest step."""
         share, reference = reference_share(calibration)
         burst = round(share * PERIOD)
-        cost = (reference.tuning_episodes, reference.expert_queries)
-        return Calibrated(PeriodicRule(burst), float(burst), *cost, reads=())
+        return Calibrated(PeriodicRule(burst), float(burst), reference.tuning_episodes, reference.expert_queries)
 
 
 class _Shuffled:

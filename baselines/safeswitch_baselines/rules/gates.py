@@ -26,6 +26,13 @@ from safeswitch_baselines.signals.discrepancy import TAU
 class Gate:
     """Gives control back: the expert drives from the step after `enters` until the step after `leaves`."""
 
+    signal: str
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """Ids of the signals that it looks at; no other one need be computed."""
+        return (self.signal,)
+
     def reset(self, seed: int) -> None:
         """Give the learner control."""
         self._driver = Driver.LEARNER
@@ -89,7 +96,7 @@ class SafeDAgger(OnDiscrepancy):
 
     def calibrate(self, calibration: Calibration) -> Calibrated:
         """Nothing to choose: the classifier's own boundary."""
-        return Calibrated(SafetyGate(self.signal), 0.5, reads=(self.signal,))
+        return Calibrated(SafetyGate(self.signal), 0.5)
 
 
 class LazyGate(Gate):
@@ -124,7 +131,7 @@ class LazyDAgger(OnDiscrepancy):
 
     def calibrate(self, calibration: Calibration) -> Calibrated:
         """Nothing to choose."""
-        return Calibrated(LazyGate(self.signal, TAU / LAZY_RATIO**0.5), 0.5, reads=(self.signal,))
+        return Calibrated(LazyGate(self.signal, TAU / LAZY_RATIO**0.5), 0.5)
 
 
 class EnsembleGate(Gate):
@@ -159,8 +166,7 @@ class EnsembleDAgger(SignalMethod):
     def calibrate(self, calibration: Calibration) -> Calibrated:
         """Quantile over steps."""
         doubt = float(np.nanquantile(calibration.nominal.signals[self.signal], 0.99))
-        rule = EnsembleGate(self.signal, doubt, TAU)
-        return Calibrated(rule, doubt, len(calibration.nominal), reads=(self.signal,))
+        return Calibrated(EnsembleGate(self.signal, doubt, TAU), doubt, len(calibration.nominal))
 
 
 class ThriftyGate(Gate):
@@ -170,6 +176,11 @@ class ThriftyGate(Gate):
         self.signal, self.critic = signal, critic
         self.novelty, self.risk, self.ordinary, self.close = novelty, risk, ordinary, close
         self.reset(0)
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """The signal, and those of the critic."""
+        return (self.signal, *self.critic.names)
 
     def enters(self, step: int, signals: Mapping[str, float]) -> bool:
         """Novel or risky."""

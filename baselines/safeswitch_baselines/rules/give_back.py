@@ -8,7 +8,6 @@ undisturbed steps. The dwell keeps the rule from chattering while the signal cro
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 
@@ -59,6 +58,7 @@ class DwellOnSignal(Dwell):
     def __init__(self, signal: str, upper: float, lower: float):
         super().__init__(upper, lower)
         self.signal = signal
+        self.reads = (signal,)
 
     def value(self, step: int, signals: Mapping[str, float]) -> float:
         """The signal."""
@@ -82,4 +82,4 @@ class CEMTwo(SignalMethod):
         learned = CEM(self.signal).calibrate(calibration)
         lower = float(np.nanquantile(calibration.nominal.signals[self.signal], LEVEL))
         rule = DwellOnSignal(self.signal, learned.threshold, lower)
-        return replace(learned, rule=rule, log={}, reads=(self.signal,))
+        return Calibrated(rule, learned.threshold, learned.tuning_episodes, learned.expert_queries)

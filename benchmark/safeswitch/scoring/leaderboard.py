@@ -17,6 +17,8 @@ import pandas as pd
 
 from safeswitch.protocols import Array
 from safeswitch.scoring.cells import PairedEpisodes, cells, paired_episodes
+from safeswitch.scoring.intervals import COLUMNS as INTERVALS
+from safeswitch.scoring.intervals import score_intervals
 from safeswitch.scoring.metrics import (
     CELL,
     MIN_CONTEST,
@@ -41,7 +43,7 @@ FURTHER = [
     *(f"return_phi{phi:g}" for phi in OTHER_PHIS), *(f"return_prevalence{100 * p:g}" for p in OTHER_PREVALENCES),
     "return_learner_min", "return_learner_max", "success_learner_min", "success_learner_max", "success_interval",
     "contest_gap", "contest_share", "needing_handover", "missed", "share_used", "false_alarms_before_onset",
-    "harm_disturbed", "harm_undisturbed", "expert_queries",
+    "harm_disturbed", "harm_undisturbed", "expert_queries", *INTERVALS,
 ]  # fmt: skip
 
 
@@ -69,7 +71,7 @@ def leaderboard(
     ]
     scored = pd.DataFrame([row[1] for row in intervals])
     scored.index = pd.MultiIndex.from_tuples([row[0] for row in intervals], names=key)
-    table = summary(frame, infos).join(scored).reset_index()
+    table = summary(frame, infos).join(scored).join(score_intervals(frame, infos, resamples, seed)).reset_index()
     extra = [name for name in key if name not in LEADING]
     return table[LEADING + extra + FURTHER].sort_values(key, kind="stable", ignore_index=True)
 

@@ -19,8 +19,10 @@ from safeswitch.tasks.track import Track
 
 Array = NDArray[np.float64]
 
-MET = (45, 95)
+MET = (40, 80)
 """Control steps, at the nominal speed, between which it is met."""
+LATEST = 94
+"""The same of one that would be in view at the start if it stood nearer."""
 STRIDE = 0.25
 """Distance of the places that are considered [m]."""
 KNOWN_STRIDE = 1.0
@@ -55,10 +57,11 @@ class Placing:
             rng: decides between equally good places.
         """
         start, _ = self.track.project(qpos[0], qpos[1])
-        places = start + np.arange(MET[0] * stride, MET[1] * stride, STRIDE)
+        places = start + np.arange(MET[0] * stride, LATEST * stride, STRIDE)
         cost = rng.uniform(0.0, SCATTER, len(places))
         if placed.sight is not None:
             cost += np.abs(self.distances(places, placed.lateral) - placed.sight)
+        cost[places > start + MET[1] * stride] += FURTHEST  # after all others
         order = places[np.argsort(cost)]
         for side in (1.0, -1.0):  # the other side where this one offers nothing
             placed.lateral *= side

@@ -90,7 +90,7 @@ class RallyCarEnv(TaskEnv):
 
     The car starts anywhere along the lap, near the middle (+-0.25 m, +-0.1 rad), at about 4 m/s with settled suspension
     and turning wheels. The episode *terminates*, a failure, when any part of the car leaves the track (3 m wide), when
-    it touches an obstacle, or when it turns over. It is *truncated* after T = 120 steps of 0.05 s, a success.
+    it touches an obstacle, or when it turns over. It is *truncated* after T = 100 steps of 0.05 s, a success.
 
     ## Info (the same keys at reset and at every step)
 
@@ -280,7 +280,7 @@ class RallyCarEnv(TaskEnv):
 
     def _grip(self) -> Array | None:
         """Factors (4,) of the friction under the tyres; None where the ground is as ever."""
-        if not isinstance(self.disturbance, Placed):
+        if not (isinstance(self.disturbance, Placed) and self.disturbance.slippery):
             return None
         x, y, *_ = self._qpos
         return self.disturbance.grip(corners(x, y, yaw_of(self._qpos), (-REAR, FRONT, 0.5 * GAUGE)))

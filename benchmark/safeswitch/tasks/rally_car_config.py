@@ -11,7 +11,7 @@ CONTROL_DT = 0.05
 """Control period [s]."""
 TIMESTEP = 0.005
 """Time step of the simulation [s]: yaw rates agree with those at 0.0025 s to 0.1 %."""
-HORIZON = 120
+HORIZON = 100
 """T, control steps of an episode: 6 s, long enough to meet an obstacle and drive on."""
 SPEED = 4.0
 """[m/s]"""

@@ -46,7 +46,7 @@ class RallyCarImageEnv(RallyCarEnv):
     ## Start, end, success
 
     As in `SafeSwitch/RallyCar-v0`: anywhere along the lap at about 4 m/s; the episode terminates when any part of the
-    car leaves the track, touches an obstacle, or turns over; it is a success when T = 120 steps of 0.05 s are survived.
+    car leaves the track, touches an obstacle, or turns over; it is a success when T = 100 steps of 0.05 s are survived.
 
     ## Info (the same keys at reset and at every step)
 

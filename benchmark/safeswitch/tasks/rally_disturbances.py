@@ -47,9 +47,11 @@ class Placed(RallyDisturbance):
         bodies: names of the bodies that it may be.
         sight: distance before it, along the track, at which it should come into view [m]; None: any.
         lateral: its lateral offset [m].
+        slippery: whether `grip` has anything to say.
     """
 
     placed = True
+    slippery: ClassVar[bool] = False
     bodies: ClassVar[tuple[str, ...]]
     sight: float | None = None
     lateral: float = 0.0
@@ -145,6 +147,7 @@ class Mud(Placed):
 
     name = "mud"
     kind = "dynamics"
+    slippery = True
     levels = (0.6, 0.45, 0.3, 0.22, 0.15)
     sentence = "friction is multiplied by {:g} on a dark, wet patch of the track, 3 m long"
     bodies = ("patch_round",)
