@@ -15,7 +15,7 @@ export MUJOCO_GL
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help setup bench demos test test-slow perf lint clean
+.PHONY: help setup bench demos test test-slow perf docs lint clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -33,12 +33,18 @@ demos: setup ## record the expert's demonstrations only (PROFILE=, TASK=, JOBS=)
 test: setup ## run the tests, without the slow ones
 	$(BIN)/python -m pytest -m "not slow" -n $(TEST_JOBS)
 
-test-slow: setup ## run the slow tests: packaging, long properties, full protocols
+test-slow: ## run the slow tests: packaging, long properties, full protocols, the report in a browser, documentation
+	@bash scripts/setup.sh dev,browser,docs
 	$(BIN)/python -m pytest -m slow -n $(TEST_JOBS)
 
 perf: ## time the expert, pictures, decisions from images and the handover table, each beside a rival
 	@bash scripts/setup.sh dev,perf
 	$(BIN)/python -m safeswitch.perf
+
+docs: ## build the documentation site in build/docs; a warning is an error
+	@bash scripts/setup.sh dev,docs
+	$(BIN)/python -m sphinx -W --keep-going -n -q -b html docs build/docs
+	@echo "documentation in build/docs/index.html"
 
 lint: setup ## ruff and mypy
 	$(BIN)/ruff check .

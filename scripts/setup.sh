@@ -70,6 +70,11 @@ probe_linux() {
   case "$extras" in *perf*) # crocoddyl's side of the comparison is C++
     if ! command -v g++ >/dev/null; then debian+=(g++); reasons+=("compiling crocoddyl's model"); fi ;;
   esac
+  case "$extras" in *browser*) # the tests of the report drive one
+    if ! command -v chromium >/dev/null || ! command -v chromedriver >/dev/null; then
+      debian+=(chromium chromium-driver); reasons+=("tests of the report in a browser")
+    fi ;;
+  esac
   if [ "${MUJOCO_GL:-egl}" = egl ] && ! egl_works "$python"; then
     debian+=(libegl1 libgl1-mesa-dri libopengl0); reasons+=("rendering without a display (EGL)")
   fi

@@ -14,10 +14,8 @@ from safeswitch import cli, doctor, registry, suite
 from safeswitch.console import console
 from safeswitch.doctor import Check
 
-COMMANDS = (
-    *("bench", "demos", "train", "evaluate", "submit", "leaderboard", "verify", "score", "compare", "reference"),
-    *("gate", "list", "play", "doctor"),
-)
+COMMANDS = ("bench", "report", "demos", "train", "evaluate", "submit", "leaderboard", "verify", "score", "compare")
+COMMANDS += ("reference", "gate", "list", "play", "doctor")
 
 
 def run(capsys: Any, *arguments: str) -> tuple[int, str]:
@@ -149,6 +147,8 @@ def test_bench_writes_the_results(capsys: Any, micro: list[str], tmp_path: Path)
     for name in ("leaderboard.csv", "leaderboard.md", "signals.csv", "comparisons.csv", "manifest.json"):
         assert (tmp_path / "results" / name).stat().st_size > 0
     assert (tmp_path / "results" / "figures" / "cart-pole" / "cem-total-onset.png").exists()
+    assert (tmp_path / "results" / "tables" / "cart-pole" / "thresholds.csv").exists()
+    assert str(tmp_path / "results" / "report.html") in text and (tmp_path / "results" / "report.html").exists()
     before = (tmp_path / "results" / "leaderboard.csv").read_bytes()
     code, _ = run(capsys, "bench", *micro, "--results", str(tmp_path / "results"))
     assert code == 0 and (tmp_path / "results" / "leaderboard.csv").read_bytes() == before

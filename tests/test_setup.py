@@ -161,6 +161,10 @@ def test_it_installs_again_only_after_a_change(machine: Machine, tmp_path: Path)
     machine.command("g++", "exit 0")
     assert machine.setup("dev,perf").returncode == 0 and machine.installs()[0].endswith(".[dev,perf]")
     assert machine.setup().returncode == 0 and machine.installs() == []
+    assert machine.setup("dev,browser").returncode == 1  # nor a browser for the tests of the report
+    for command in ("chromium", "chromedriver"):
+        machine.command(command, "exit 0")
+    assert machine.setup("dev,browser").returncode == 0 and machine.installs()[0].endswith(".[dev,browser]")
 
 
 def test_a_failed_install_is_tried_again(machine: Machine) -> None:

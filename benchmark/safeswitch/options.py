@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from safeswitch import suite
-from safeswitch.console import console
+from safeswitch.console import set_output
 
 if TYPE_CHECKING:
     from safeswitch.evaluation import Evaluation
@@ -17,7 +17,24 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class Common:
+class Output:
+    """What is shown.
+
+    Attributes:
+        json: put the answer on standard output as one JSON document.
+        quiet: print errors only (and the JSON document, if it is asked for).
+    """
+
+    json: bool = False
+    quiet: bool = False
+
+    def set(self) -> None:
+        """Show no more than what was asked for."""
+        set_output(self.quiet, self.json)
+
+
+@dataclass
+class Common(Output):
     """Options that every command on runs shares.
 
     Attributes:
@@ -25,21 +42,19 @@ class Common:
         task: one task only; all tasks where it is left out.
         jobs: processes at a time (default: the number of cores); results do not depend on it.
         store: folder of finished work (default: .safeswitch/store in the checkout, or $SAFESWITCH_STORE).
-        quiet: print errors only.
     """
 
     profile: str = "standard"
     task: str | None = None
     jobs: int | None = None
     store: Path | None = None
-    quiet: bool = False
 
     def runs(self) -> list:
         """One run per task."""
         from safeswitch.pipeline import Run
         from safeswitch.store import Store
 
-        console.quiet = self.quiet
+        self.set()
         if self.jobs is not None and self.jobs < 1:
             raise ValueError(f"--jobs must be at least 1, got {self.jobs}")
         tasks = [suite.task(self.task)] if self.task else list(suite.TASKS.values())

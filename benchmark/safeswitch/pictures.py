@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from safeswitch import registry, scoring_stages, stages
-from safeswitch.files import load_arrays, load_frame
+from safeswitch.files import load_arrays, load_frame, save_json
 from safeswitch.handover.episode import Episode, NeverSwitch, run_episode
 from safeswitch.handover.panel import PHI, Calibration, Panel
 from safeswitch.handover.table import HandoverTable
@@ -35,6 +35,9 @@ SIGNAL = "total"
 """The paper's signal, of which the film and the episode's figure are."""
 
 RULE = f"cem@{SIGNAL}"
+
+STORY = "story.json"
+"""Beside the films of one episode under several drivers: what the report draws next to them."""
 
 LEARNING_SIGNALS = (SIGNAL, "epistemic")
 """Signals for which CEM's learning is always drawn: the paper's, and the one that is its cause."""
@@ -157,12 +160,14 @@ class Story:
         runs: driver -> its episode, recorded with snapshots: the learner alone, a fixed threshold, CEM, the expert.
         thresholds: driver -> threshold on `SIGNAL`, for those that have one.
         t_first: `t*_first` [steps].
+        t_last: `t*_last` [steps].
     """
 
     task: Task
     runs: dict[str, Episode]
     thresholds: dict[str, float]
     t_first: float
+    t_last: float
 
     @property
     def title(self) -> str:
@@ -193,7 +198,7 @@ def _drive_story(
     runs = {name: _drive(task, env, trained, rule, seed, arming) for name, (rule, arming) in drivers.items()}
     env.close()
     thresholds = {name: _threshold(rows, "onset", name) for name in (fixed, RULE)}
-    return Story(task, runs, thresholds, float(table.t_first[index]))
+    return Story(task, runs, thresholds, float(table.t_first[index]), float(table.t_last[index]))
 
 
 def _typical_fixed(rows: pd.DataFrame, horizon: int) -> str:
@@ -249,8 +254,44 @@ def _draw_film(story: Story, target: Path) -> None:
         threshold = story.thresholds.get(name)
         trace = Trace(SIGNAL, run.signals[SIGNAL], run.driver, env.control_dt, story.marks(name), threshold, limits)
         tiles.append(replay_frames(env, run, name, trace))
-    write_side_by_side(tiles, target / "episode.mp4", round(1 / env.control_dt), columns=2)
+    fps = round(1 / env.control_dt)
+    write_side_by_side(tiles, target / "episode.mp4", fps, columns=2)
+    for name, run in story.runs.items():
+        write_side_by_side([replay_frames(env, run, name)], target / _film_name(name), fps)
+    save_json(target / STORY, _story_facts(story, fps))
     env.close()
+
+
+def _film_name(driver: str) -> str:
+    return f"film-{driver.replace('@', '-')}.mp4"
+
+
+def _story_facts(story: Story, fps: int) -> dict[str, Any]:
+    """What the report draws beside the films: when what happened, and the signal's trace under each driver [steps]."""
+    alone = story.runs["learner"]
+    return {
+        "cell": str(story.task.paper_cell),
+        "seed": alone.seed,
+        "learner": 0,
+        "signal": SIGNAL,
+        "fps": fps,
+        "horizon": alone.horizon,
+        "t_first": story.t_first,
+        "t_last": story.t_last,
+        "runs": [
+            {
+                "driver": name,
+                "file": _film_name(name),
+                "threshold": story.thresholds.get(name),
+                "onset": run.onset,
+                "handover": run.handover,
+                "length": run.length,
+                "success": bool(run.success),
+                "trace": [round(float(value), 6) for value in run.signals[SIGNAL]],
+            }
+            for name, run in story.runs.items()
+        ],
+    }
 
 
 def _film_env(task: Task) -> TaskEnv:

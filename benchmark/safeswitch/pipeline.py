@@ -8,15 +8,16 @@ it depends on, so that a second run computes nothing and an interrupted one cont
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+import warnings
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
 
 from joblib import Parallel, delayed, parallel_config
 
-from safeswitch import factories, publish
-from safeswitch.console import Progress
+from safeswitch import durations, factories, publish
+from safeswitch.console import Progress, StageError
 from safeswitch.scoring.metrics import TaskInfo
 from safeswitch.scoring_stages import episodes_job, signals_job
 from safeswitch.stages import (
@@ -34,6 +35,20 @@ from safeswitch.store import Key, Store
 from safeswitch.suite import Cell, Profile, Split, Task, others
 from safeswitch.trained import Trained, fitted_signals, needs_members, with_signals_of
 
+STAGES = (
+    "demonstrations",
+    "training",
+    "signal fits",
+    "handover tables",
+    "switch rules",
+    "further severities",
+    "signal quality",
+    "scores",
+    "CEM seeds",
+    "figures",
+)
+"""Every stage by the name under which it is shown, in order."""
+
 PAPER = ("epistemic", "aleatoric", "total")
 """The signals of the paper."""
 
@@ -49,6 +64,10 @@ class Run:
         workers: processes at a time; the results do not depend on it.
         seconds: wall time spent in each stage by this run [s]; next to nothing where the work was done before.
         work: time that the jobs of each stage took when they were run, added up over workers [s].
+        jobs: number of jobs of each stage.
+        title: what the task is called while it runs; its name by default.
+        plan: the stages that the command goes through, where it goes through all; they are then numbered.
+        typical: what the stages took in an earlier run, from which the time left is guessed.
     """
 
     task: Task
@@ -57,10 +76,15 @@ class Run:
     workers: int = 2
     seconds: dict[str, float] = field(default_factory=dict)
     work: dict[str, float] = field(default_factory=dict)
+    jobs: dict[str, int] = field(default_factory=dict)
+    title: str = ""
+    plan: tuple[str, ...] = ()
+    typical: dict[str, durations.Stage] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Leave out the signals that need more learners than the profile has."""
         self.task = with_signals_of(self.task, self.profile.learners)
+        self._spent: dict[str, dict[str, float]] = {}  # stage -> job -> seconds
 
     @cached_property
     def demonstrations(self) -> Job:
@@ -244,25 +268,55 @@ class Run:
             self.task, learner=self.task.literal, learner_options=self.task.literal_options, signals=PAPER, literal=""
         )
         profile = replace(self.profile, learners=self.profile.literal_learners, cells=2, signal_severities=())
-        return Run(task, profile, self.store, self.workers)
+        plan = STAGES[: STAGES.index("scores") + 1]
+        run = Run(task, profile, self.store, self.workers, title=f"{task.name}, paper's learner")
+        run.plan = tuple(stage for stage in run.stages if stage in plan)
+        return run
 
     def _gives_back(self, cell: object) -> bool:
         return cell in self.task.cells[: self.profile.give_back_cells] and not self.task.costly
 
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """Names of the stages from demonstrations to figures, in the order in which `publish` computes them."""
+        further = self.task.severities(*self.profile.signal_severities)
+        left_out = {
+            "signal fits": not fitted_signals(self.task),
+            "further severities": all(only_seen(cell) for cell in further),
+        }
+        return tuple(stage for stage in STAGES if not left_out.get(stage))
+
     def finish(self, stage: str, jobs: Iterable[Job]) -> None:
         """Run the jobs that the store does not hold yet, `workers` at a time, with a progress bar."""
-        jobs = list(jobs)
+        jobs = list({job.key: job for job in jobs}.values())
         started = time.perf_counter()
-        pending = list({job.key: job for job in jobs if not self.store.has(job.key)}.values())
-        with Progress(f"{self.task.name}: {stage}", len(jobs), len(jobs) - len(pending)) as progress:
-            with parallel_config("loky", n_jobs=min(self.workers, max(len(pending), 1)), inner_max_num_threads=1):
-                done = Parallel(return_as="generator_unordered")(
+        pending = [job for job in jobs if not self.store.has(job.key)]
+        expected = durations.of_stage(self.typical, stage, len(pending), self.workers)
+        with Progress(self._label(stage), len(jobs), len(jobs) - len(pending), expected) as progress:
+            try:
+                for label in self._run(pending):
+                    progress.advance(label)
+            except ValueError:
+                raise  # a setting that is refused
+            except Exception as error:
+                raise StageError(f"{self.task.name}: {stage} failed: {type(error).__name__}: {error}") from error
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - started
+        for job in jobs:
+            self._spent.setdefault(stage, {})[job.key] = self.store.recipe(job.key)["seconds"]
+        self.work[stage], self.jobs[stage] = sum(self._spent[stage].values()), len(self._spent[stage])
+
+    def _run(self, pending: list[Job]) -> Iterator[str]:
+        """Labels of the jobs, each as soon as it is finished."""
+        with parallel_config("loky", n_jobs=min(self.workers, max(len(pending), 1)), inner_max_num_threads=1):
+            with warnings.catch_warnings():  # loky replaces a worker whose memory has grown, and warns of it
+                warnings.filterwarnings("ignore", message="A worker stopped while some jobs", category=UserWarning)
+                yield from Parallel(return_as="generator_unordered")(
                     delayed(run_job)(str(self.store.root), job) for job in pending
                 )
-                for label in done:
-                    progress.advance(label)
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - started
-        self.work[stage] = sum(self.store.recipe(job.key)["seconds"] for job in jobs)
+
+    def _label(self, stage: str) -> str:
+        number = f"{self.plan.index(stage) + 1}/{len(self.plan)} " if stage in self.plan else ""
+        return f"{self.title or self.task.name} {number}{stage:<{max(map(len, STAGES)) if number else 0}}"
 
 
 def run_job(root: str, job: Job) -> str:

@@ -18,11 +18,12 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 from rich.markup import escape
 
-from safeswitch import pictures, registry
-from safeswitch.console import console
-from safeswitch.files import load_json, save_frame, save_json
-from safeswitch.handover.published import write_table
+from safeswitch import durations, pictures, registry
+from safeswitch.console import log
+from safeswitch.files import load_frame, load_json, save_frame, save_json
+from safeswitch.handover.published import file_name, write_table
 from safeswitch.handover.table import HandoverTable
+from safeswitch.report.views import tables_in
 from safeswitch.scoring.comparisons import paired_comparisons
 from safeswitch.scoring.leaderboard import leaderboard, merge_task_rows, read_csv, write_csv
 from safeswitch.scoring.left_out import left_out_lines, left_out_table
@@ -30,6 +31,8 @@ from safeswitch.scoring.markdown import write_markdown
 from safeswitch.scoring.metrics import TaskInfo
 from safeswitch.scoring.sightings import sighting_table
 from safeswitch.scoring.signal_quality import signal_table
+from safeswitch.scoring.thresholds import FILE as THRESHOLDS
+from safeswitch.scoring.thresholds import plain_thresholds, write_thresholds
 from safeswitch.scoring_stages import calibration_of, protocols_of
 from safeswitch.stages import Job, complete_job, load_rows, source_of
 from safeswitch.store import Store
@@ -55,8 +58,9 @@ def publish(run: Run, folder: Path | None = None) -> Path:
     folder = (folder or default_folder(run.profile.name)).absolute()
     started = time.time()
     commit = git_commit()  # before anything is written into the checkout
+    run.plan, run.typical = run.stages, durations.stages(run.task.name, run.profile.name, folder)
     for reason in without_extra().values():
-        console.print(f"[yellow]{escape(reason)}[/]")
+        log.print(f"[yellow]{escape(reason)}[/]")
     scores, spread, figures = run.scores, run.spread, run.figures
     folder.mkdir(parents=True, exist_ok=True)
     for name in TABLES:
@@ -70,8 +74,7 @@ def publish(run: Run, folder: Path | None = None) -> Path:
             table = read_csv(run.store.folder(run.literal.scores.key) / f"{name}.csv")
             _merge(folder / f"paper_literal_{name}.csv", table)
     _replace(run.store.folder(figures.key) / "figures", folder / "figures" / run.task.name)
-    if run.profile.tables:
-        _write_tables(run, folder / "tables" / run.task.name)
+    _write_tables(run, folder / "tables" / run.task.name)
     manifest = _manifest(run, folder, commit, time.time() - started)
     save_json(folder / "manifest.json", manifest)
     names = dict.fromkeys(name for task in (run.task, *TASKS.values()) for name in methods(task.signals))
@@ -164,7 +167,34 @@ def figures_job(store: Store, task: Task, trained: Trained, episodes: Job, table
 
 
 def _write_tables(run: Run, folder: Path) -> None:
-    """Complete tables of the first three cells, both splits apart, to score latched rules without MuJoCo."""
+    """Tables of the first three cells, to score latched rules without MuJoCo.
+
+    In the full profile both splits, apart and with every outcome computed; otherwise the test episodes with the
+    outcomes that are known. Beside them, to the last bit, the thresholds of those methods that are a constant one.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    rows = {}
+    for job in run.episodes:
+        cell, trained = job.arguments[2], job.arguments[3]
+        if cell in run.task.cells[:3]:
+            source = run.store.folder(job.key)
+            rows[cell, trained.seed] = load_frame(source / "episodes.npz")
+            if not run.profile.tables:
+                name = file_name(cell.label, cell.severity, "test", trained.seed)
+                shutil.copyfile(source / "test.npz", folder / name)
+    if run.profile.tables:
+        _write_complete_tables(run, folder)
+    plain = []
+    for view in tables_in(folder, run.task).views():
+        for learner, panel in view.panels.items():
+            frame = rows[view.cell, learner]
+            plain.append(plain_thresholds(panel, frame[frame["protocol"] == view.protocol]))
+    write_thresholds(pd.concat(plain, ignore_index=True), folder / THRESHOLDS)
+
+
+def _write_complete_tables(run: Run, folder: Path) -> None:
+    """Both splits of the first three cells; the calibrate episodes that thresholds come from."""
     jobs: dict[tuple[Cell, Split, int], Job] = {}
     for seed, cell in product(range(run.profile.learners), run.task.cells[:3]):
         tables = run.tables[seed, str(cell)]
@@ -174,7 +204,6 @@ def _write_tables(run: Run, folder: Path) -> None:
         for split, recorded in keys.items():
             jobs[cell, split, seed] = complete_job(run.store, run.task, cell, recorded)
     run.finish("published tables", jobs.values())
-    shutil.rmtree(folder, ignore_errors=True)
     for (cell, split, seed), job in jobs.items():
         write_table(HandoverTable.load(run.store.folder(job.key) / "table.npz"), folder, cell, split, seed)
 
@@ -203,7 +232,11 @@ def _manifest(run: Run, folder: Path, commit: str, seconds: float) -> dict[str, 
         "episodes": {"calibrate": run.profile.calibrate, "test": run.profile.test},
         "episode_seeds": {split: index * SPLIT_SIZE for index, split in enumerate(SPLITS)},
         "stage_seconds": {
-            name: {"wall, this run": round(wall, 1), "work, when computed": round(run.work[name], 1)}
+            name: {
+                "wall, this run": round(wall, 1),
+                "work, when computed": round(run.work[name], 1),
+                "jobs": run.jobs[name],
+            }
             for name, wall in run.seconds.items()
         },
         "wall_seconds": round(seconds, 1),

@@ -10,8 +10,8 @@ import tyro
 from rich.markup import escape
 from rich.table import Table
 
-from safeswitch.console import console
-from safeswitch.options import Common, Contestant
+from safeswitch.console import answer
+from safeswitch.options import Common, Contestant, Output
 
 
 @dataclass
@@ -47,11 +47,12 @@ class Submit:
         found = self.contestant.evaluate(run)
         path = submissions.write(found, folder, *about)
         score = f"return {found.scores['return_mean']:.3f}, success {found.scores['success']:.3f}"
-        console.print(f"{self.name} in {found.cell} ({found.protocol}): {score}; submission in [cyan]{path}[/]")
+        text = f"{self.name} in {found.cell} ({found.protocol}): {score}; submission in [cyan]{path}[/]"
+        answer({"submission": path, "scores": found.scores}, text)
 
 
 @dataclass
-class Leaderboard:
+class Leaderboard(Output):
     """Check every submission and write the table of those that hold beside the leaderboard. Exit code 1: some do not.
 
     Attributes:
@@ -67,16 +68,17 @@ class Leaderboard:
         from safeswitch.publish import default_folder
         from safeswitch.verification import merge
 
+        self.set()
         folder = self.results or default_folder("full")
         table, refused = merge(folder, self.minimum_episodes)
-        for name, reason in refused.items():
-            console.print(f"[bold red]refused[/] {escape(name)}: {escape(reason)}")
-        console.print(f"{len(table)} merged, {len(refused)} refused; table in [cyan]{folder / 'submissions.md'}[/]")
+        shown = [f"[bold red]refused[/] {escape(name)}: {escape(reason)}" for name, reason in refused.items()]
+        shown.append(f"{len(table)} merged, {len(refused)} refused; table in [cyan]{folder / 'submissions.md'}[/]")
+        answer({"merged": table["file"].tolist(), "refused": refused}, *shown)
         return 1 if refused else 0
 
 
-@dataclass
-class Verify:
+@dataclass(kw_only=True)
+class Verify(Output):
     """Run a submission again on kept-back episodes, and tell whether it agrees (maintainers). Exit code 1: it does not.
 
     The code of learner and rule must be importable. It is somebody else's: run it in a container without a network.
@@ -104,7 +106,14 @@ class Verify:
             raise ValueError(f"there is no submission {self.submission}")
         submission = read(self.submission)
         content = submission.content
-        (run,) = Common(content["profile"]["name"], content["cell"]["task"], self.jobs, self.store).runs()
+        (run,) = Common(
+            json=self.json,
+            quiet=self.quiet,
+            profile=content["profile"]["name"],
+            task=content["cell"]["task"],
+            jobs=self.jobs,
+            store=self.store,
+        ).runs()
         record = verify(run, submission, secret)
         table = Table("score", "reported", "on kept-back episodes", "intervals overlap", title=content["name"])
         for name, agrees in record["agreement"].items():
@@ -114,6 +123,5 @@ class Verify:
                 for scores in (submission.scores, record["scores"])
             ]
             table.add_row(name, *shown, "yes" if agrees else "NO")
-        console.print(table)
-        console.print("verified" if record["agrees"] else "[bold red]not confirmed[/]")
+        answer(record, table, "verified" if record["agrees"] else "[bold red]not confirmed[/]")
         return 0 if record["agrees"] else 1

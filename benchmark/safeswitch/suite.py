@@ -405,7 +405,8 @@ class Profile:
         give_back_cells: cells, from the front, in which rules that give control back are run as plain episodes.
         demonstrations: overrides of the task's demonstrations.
         learner_options: overrides of the learner's configuration.
-        tables: whether the tables of the first three cells are committed with the results.
+        tables: whether the tables of the first three cells hold both splits and every outcome; otherwise they have the
+            test episodes with what is known.
         signal_severities: further severities of every disturbance at which the signals, and nothing else, are scored.
         signal_episodes: test episodes of those.
         literal_learners: number of learner seeds of the paper's learner taken literally.

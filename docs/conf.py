@@ -1,0 +1,111 @@
+"""Sphinx: `make docs` builds build/docs from this folder, with every warning an error."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import safeswitch
+
+ROOT = Path(__file__).resolve().parents[1]
+
+project = "SafeSwitch"
+author = "SafeSwitch developers"
+copyright = author
+version = release = safeswitch.__version__
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.mathjax",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+]
+exclude_patterns = ["_templates"]
+templates_path = ["_templates"]
+myst_enable_extensions = ["colon_fence", "deflist"]
+myst_heading_anchors = 3
+
+html_theme = "furo"
+html_title = f"SafeSwitch {release}"
+html_static_path = ["_static"]
+html_css_files = ["wide.css"]
+html_theme_options = {"navigation_with_keys": True}
+
+# ---- API pages, from the docstrings
+autosummary_generate = True
+autosummary_ignore_module_all = False
+autodoc_member_order = "bysource"
+autodoc_typehints = "signature"
+autodoc_default_options = {"members": True, "show-inheritance": True}
+default_role = "code"
+napoleon_google_docstring = True
+napoleon_numpy_docstring = False
+napoleon_use_ivar = True
+nitpicky = True
+nitpick_ignore_regex = [
+    (r"py:.*", r"(?!safeswitch).*"),  # other projects' objects, and short names of type hints
+    (r"py:.*", r"safeswitch.*\.([A-Z]|Annotated|Marks)"),  # type variables and aliases
+]
+
+
+def _plain(app: Any, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+    """Escape what reStructuredText takes for markup in a docstring that is plain text, outside of literal text."""
+    if any(line.startswith("## ") for line in lines):  # written in Markdown, with tables: shown as it is
+        body = lines.index("") if "" in lines else len(lines)
+        lines[body:] = ["", ".. code-block:: text", "", *(f"   {line}" for line in lines[body:]), ""]
+        return
+    if what == "module":
+        lines[:] = _literal_blocks(lines)
+    for i, line in enumerate(lines):
+        field = re.match(r"\s*(:[^:]*:|\.\.|\* )?", line)
+        start, rest = line[: field.end()], line[field.end() :]  # type: ignore[union-attr]
+        if start.strip() == ".." or (what == "module" and line.startswith("    ")):
+            continue
+        parts = re.split(r"(``.*?``|`[^`]*`|:\w+:`[^`]*`)", rest)
+        parts[::2] = [re.sub(r"([*|])|(?<=\w)(_)(?=\W|$)", r"\\\g<0>", part) for part in parts[::2]]
+        lines[i] = start + "".join(parts)
+
+
+def _literal_blocks(lines: list[str]) -> list[str]:
+    """The same with `::` before blocks that are set off by an indentation: formulas and tables of modules."""
+    found: list[str] = []
+    for line in lines:
+        last = next((each for each in reversed(found) if each.strip()), "")
+        inside = last.startswith("    ") or last.rstrip().endswith("::") or last.startswith(("* ", "- "))
+        if line.startswith("    ") and not inside and found and not found[-1].strip():
+            found += ["::", ""]
+        found.append(line)
+    return found
+
+
+def _outside(app: Any, docname: str, source: list[str]) -> None:
+    """Links to files of the repository that are no pages of this site become names: the site works by itself."""
+    included = {
+        "../CONTRIBUTING.md": "contributing.md",
+        "../CHANGELOG.md": "changelog.md",
+        "../assets/README.md": "assets.md",
+    }
+
+    def link(match: re.Match[str]) -> str:
+        text, target = match[1], match[2]
+        if target in included:
+            return f"[{text}]({included[target]})"
+        return f"{text} (`{target.removeprefix('../')}` in the repository)" if target.startswith("../") else match[0]
+
+    if docname == "index":  # patterns for pages that not every version has
+        lines = source[0].splitlines(keepends=True)
+        source[0] = "".join(line for line in lines if not re.fullmatch(r"\w+\*\n", line) or _matches(line.strip()))
+    source[0] = re.sub(r"(?<!!)\[([^\]]+)\]\(([^)\s]+)\)", link, source[0])
+
+
+def _matches(pattern: str) -> bool:
+    return any(Path(__file__).parent.glob(f"{pattern}.md"))
+
+
+def setup(app: Any) -> None:
+    """Hooks of this site."""
+    app.connect("autodoc-process-docstring", _plain, priority=900)  # after napoleon
+    app.connect("source-read", _outside)
+    app.connect("include-read", lambda app, relative, parent, content: _outside(app, parent, content))

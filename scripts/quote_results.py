@@ -1,0 +1,146 @@
+"""Keeps the numbers that the documentation quotes equal to the committed tables.
+
+A quoted number is followed by an HTML comment, which no reader sees, that says where it stands::
+
+    5.21<!--= leaderboard cart-pole/cart-mass-3 onset cem@total return_mean -->
+    0.94<!--= signals cart-pole/cart-mass-3 epistemic frame_auroc -->
+    0.20<!--= comparisons cart-pole/cart-mass-3 onset cem@total grid@total return_diff -->
+
+the name of a CSV file in results/, the cell, the row, the column. The number keeps as many digits as it has. Between
+`<!--rows leaderboard CELL PROTOCOL: METHOD METHOD ... -->` and `<!--/rows-->` stands a table of those methods.
+
+Between `<!--disturbances TASK-->` and `<!--/disturbances-->` stands the table of a task's disturbances.
+
+Usage: python scripts/quote_results.py [--write] [FILE ...]     (default: every page of docs/, and README.md)
+Without --write it lists what differs; the exit code is then 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import re
+import sys
+from functools import cache
+from pathlib import Path
+
+import pandas as pd
+
+from safeswitch.scoring.leaderboard import read_csv
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "results"
+NUMBER = re.compile(r"(?P<number>[-+]?\d+(?:\.(?P<digits>\d+))?|–)(?P<quote><!--= (?P<where>[^>]*?) -->)")
+ROWS = re.compile(
+    r"(?P<open><!--rows (?P<table>\S+) (?P<cell>\S+) (?P<protocol>\S+): (?P<methods>[^>]*?) -->\n)"
+    r".*?(?P<close><!--/rows-->)",
+    re.DOTALL,
+)
+DISTURBANCES = re.compile(
+    r"(?P<open><!--disturbances (?P<task>\S+)-->\n).*?(?P<close><!--/disturbances-->)", re.DOTALL
+)
+KEYS = {
+    "leaderboard": ("protocol", "method"),
+    "paper_literal_leaderboard": ("protocol", "method"),
+    "signals": ("signal",),
+    "paper_literal_signals": ("signal",),
+    "comparisons": ("protocol", "reference", "method"),
+}
+
+
+@cache
+def table(name: str) -> pd.DataFrame:
+    """A table of results/, with the cell of each row as text."""
+    if name not in KEYS:
+        raise ValueError(f"no table {name!r} to quote; there are {', '.join(KEYS)}")
+    frame = read_csv(RESULTS / f"{name}.csv")
+    severity = frame["severity"].map(lambda value: f"-{value}" if value else "")
+    return frame.assign(cell=frame["task"] + "/" + frame["disturbance"] + severity)
+
+
+def row(name: str, cell: str, *values: str) -> pd.Series:
+    """The one row of a table that a quote means."""
+    frame = table(name)
+    chosen = frame[frame["cell"] == cell]
+    for key, value in zip(KEYS[name], values, strict=True):
+        chosen = chosen[chosen[key] == value]
+    if len(chosen) != 1:
+        raise ValueError(f"{len(chosen)} rows of {name}.csv are {cell} {' '.join(values)}, expected one")
+    return chosen.iloc[0]
+
+
+def quoted(where: str) -> float:
+    """The number that stands at `where`."""
+    name, cell, *rest = where.split()
+    *values, column = rest
+    found = row(name, cell, *values)
+    if column not in found:
+        raise ValueError(f"{name}.csv has no column {column!r}")
+    return float(found[column])
+
+
+def current(text: str) -> str:
+    """`text` with every quoted number and table as it now stands in the tables."""
+
+    def number(match: re.Match[str]) -> str:
+        value, digits = quoted(match["where"]), len(match["digits"] or "")
+        sign = "+" if match["number"].startswith("+") else ""
+        shown = "–" if pd.isna(value) else f"{value:{sign}.{digits}f}"
+        return shown.replace("-0.00", "0.00") + match["quote"]
+
+    def rows(match: re.Match[str]) -> str:
+        lines = ["| method | return | success | autonomy | skill |", "| :-- | --: | --: | --: | --: |"]
+        for method in match["methods"].split():
+            found = row(match["table"], match["cell"], match["protocol"], method)
+            interval = "{return_mean:.2f} [{return_lo:.2f}, {return_hi:.2f}]".format(**found)
+            skill = "–" if pd.isna(found["contest_gap"]) else "no contest"
+            if pd.notna(found["skill"]):
+                skill = "{skill:.2f} [{skill_lo:.2f}, {skill_hi:.2f}]".format(**found)
+            lines.append(f"| `{method}` | {interval} | {found['success']:.2f} | {found['autonomy']:.2f} | {skill} |")
+        return match["open"] + "\n" + "\n".join(lines) + "\n\n" + match["close"]
+
+    def disturbances(match: re.Match[str]) -> str:
+        return match["open"] + "\n" + "\n".join(disturbance_table(match["task"])) + "\n\n" + match["close"]
+
+    return DISTURBANCES.sub(disturbances, ROWS.sub(rows, NUMBER.sub(number, text)))
+
+
+def disturbance_table(task: str) -> list[str]:
+    """Markdown table of what a task offers: name, what severity 3 does, the values of all severities."""
+    from safeswitch.tasks import visual  # noqa: F401  (registers the disturbances of images)
+    from safeswitch.tasks.disturbances import DISTURBANCES as OFFERED
+
+    lines = ["| disturbance | at severity 3 | severity 1 .. 5 |", "|---|---|---|"]
+    for name, kind in OFFERED.items():
+        if task in kind.tasks:
+            benign = " (benign)" if kind.benign else ""
+            levels = ", ".join(f"{level:g}" for level in kind.levels)
+            lines.append(f"| `{name}`{benign} | {kind.describe(3)} | {levels} |")
+    return lines
+
+
+def pages() -> list[Path]:
+    """Every page that may quote results."""
+    return [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def main() -> int:
+    """Compare or rewrite."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--write", action="store_true", help="put the numbers of the tables into the pages")
+    parser.add_argument("files", nargs="*", type=Path)
+    options, stale = parser.parse_args(), 0
+    for page in options.files or pages():
+        text = page.read_text()
+        new = current(text)
+        if not options.write:
+            changes = difflib.unified_diff(text.splitlines(), new.splitlines(), page.name, "the tables", "", "", 0, "")
+            print(*changes, sep="\n", end="")
+        stale += new != text
+        if options.write and new != text:
+            page.write_text(new)
+    return 0 if options.write else int(stale > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
