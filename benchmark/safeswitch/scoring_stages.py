@@ -74,7 +74,7 @@ def _score_episodes(
             if method.latched:
                 rows = latched_rows(test, calibrated)
             else:
-                rows = _plain_rows(task, cell, trained, test, method, calibrated.rule)
+                rows = plain_rows(task, cell, trained, test, method, calibrated.rule)
             frames.append(labelled(rows, cell, protocol, method_id, trained.seed, calibrated, own))
             logs.update({f"{protocol}|{method_id}|{name}": value for name, value in calibrated.log.items()})
         if others is not None:
@@ -120,7 +120,7 @@ def calibration_of(
     return Calibration(panel_of(loaded["calibrate"], nominal, protocol), nominal, seed=seed)
 
 
-def _plain_rows(
+def plain_rows(
     task: Task, cell: Cell, trained: Trained, test: Panel, method: Method, rule: Any
 ) -> pd.DataFrame:
     """Rules that give control back have no table: drive the same episodes."""
