@@ -96,6 +96,7 @@ class Task:
         literal: the learner as the paper describes it, where it is not the one above; it is reported beside it.
         literal_options: overrides of its configuration.
         ruled: signals that switch rules run on; all of them where it is empty.
+        spared: names of cells that no profile runs, to save time; `evaluate` and `play` take them.
         others: most learners of other seeds that an ensemble asks beside its own; None for all of them.
         costly: whether an outcome takes so long that a run must do without some: cells after the first three then have
             half the episodes, signals are scored at the severities of the cells alone, and no cell has rows that leave
@@ -116,6 +117,7 @@ class Task:
     literal: str = ""
     literal_options: Mapping[str, Any] = field(default_factory=dict, hash=False)
     ruled: tuple[str, ...] = ()
+    spared: frozenset[str] = frozenset()
     others: int | None = None
     costly: bool = False
 
@@ -219,15 +221,16 @@ def _cart_pole_image_cells() -> tuple[Cell, ...]:
 
 
 def _rally_car_image_cells() -> tuple[Cell, ...]:
-    name, others = "rally-car-image", ("mud", "dusk", "camera-dirt", "steering-bias")
+    name, others = "rally-car-image", ("mud", "dusk", "camera-dirt", "camera-pitch", "steering-bias")
     return (
         Cell(name, "obstacle", 3, "paper"),
         Cell(name, "none", 0, "none"),
         Cell(name, "roadside", 3, "benign"),
-        *(Cell(name, "obstacle", severity, "paper") for severity in (1, 5)),
+        *(Cell(name, "obstacle", severity, "paper") for severity in (1, 2, 4, 5)),
         Cell(name, "obstacle-held-out", 3, "held-out"),
         Cell(name, "obstacle", 3, "held-out", track="hollow"),
         Cell(name, "none", 0, "none", track="hollow"),
+        Cell(name, "puddle-paint", 3, "benign"),
         *(Cell(name, other, 3, "other") for other in others),
     )
 
@@ -335,6 +338,7 @@ TASKS: dict[str, Task] = {
         assets=("rally_car", "common"),
         showcase=("ensemble-mean3", "mahalanobis"),
         ruled=("epistemic", "aleatoric", "total", "total-mean3", "ensemble-mean3", "mahalanobis"),
+        spared=frozenset({"obstacle-2", "obstacle-4", "camera-pitch-3", "puddle-paint-3"}),
         others=2,
         costly=True,
     ),
@@ -442,7 +446,8 @@ class Profile:
 
     def cells_of(self, task: Task) -> tuple[Cell, ...]:
         """The cells of `task` in this profile."""
-        return task.cells[: self.cells]
+        cells = [cell for cell in task.cells if f"{cell.label}-{cell.severity}" not in task.spared]
+        return tuple(cells[: self.cells])
 
     def episodes(self, task: Task, cell: Cell, split: Split) -> int:
         """Calibrate or test episodes of a cell for each learner."""
