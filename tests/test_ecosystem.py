@@ -204,5 +204,6 @@ def test_without_tensorboard_the_flag_is_refused_before_anything_is_computed(
     for command in ("bench", "train"):
         options = ["--store", str(tmp_path / "store"), "--tensorboard", str(tmp_path / "curves")]
         assert cli.main([command, *options]) == 2
-        assert "safeswitch[tensorboard]" in capsys.readouterr().out
+        captured = capsys.readouterr()
+        assert "safeswitch[tensorboard]" in captured.out + captured.err
     assert not list(tmp_path.iterdir())

@@ -293,7 +293,8 @@ def test_the_commands_from_submission_to_verified_row(
 
     def run(*arguments: str) -> tuple[int, str]:
         code = cli.main(list(arguments))
-        return code, capsys.readouterr().out
+        captured = capsys.readouterr()
+        return code, captured.out + captured.err
 
     options = ["--profile", "micro", "--task", "cart-pole", "--jobs", "1", *store]
     about = ["--rule", "cem@total", "--name", "CEM", "--authors", "A. Nobody", *results]
