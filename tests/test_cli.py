@@ -16,8 +16,8 @@ from safeswitch.console import console
 from safeswitch.doctor import Check
 from safeswitch.pipeline import STAGES
 
-COMMANDS = ("bench", "report", "demos", "train", "evaluate", "score", "compare", "reference")
-COMMANDS += ("gate", "list", "play", "doctor")
+COMMANDS = ("bench", "report", "demos", "train", "evaluate", "submit", "leaderboard", "verify", "score", "compare")
+COMMANDS += ("reference", "gate", "list", "play", "doctor")
 
 
 def run(capsys: Any, *arguments: str) -> tuple[int, str]:
@@ -63,7 +63,10 @@ def test_list_names_everything(capsys: Any) -> None:
         (["train", "--jobs", "0"], "--jobs must be at least 1"),
         (["evaluate", "--method", "cemm@total"], "unknown method 'cemm'; valid, nearest first: cem"),
         (["evaluate", "--method", "cem"], "write 'cem@total'"),
-        (["evaluate", "--method", "periodic"], "gives control back"),
+        (["evaluate", "--learner", "bayesian-mlp"], "a learner is for one task: add --task"),
+        (["evaluate", "--task", "cart-pole", "--learner", "bayesian-mpl"], "unknown learner 'bayesian-mpl'; valid"),
+        (["evaluate", "--task", "cart-pole", "--rule", "timer", "--signals", "totl"], "unknown signal 'totl'; valid"),
+        (["submit", "--name", "a", "--authors", "b"], "a submission is about one task: add --task"),
         (["evaluate", "--protocol", "onse"], "unknown protocol 'onse'; valid, nearest first: onset"),
         (["evaluate", "--disturbance", "cart-mas"], "unknown cell 'cart-pole/cart-mas-3'; valid, nearest first"),
         (["evaluate", "--disturbance", "none"], "has no onset: score it with --protocol start"),

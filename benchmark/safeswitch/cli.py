@@ -16,61 +16,10 @@ import tyro
 from rich.markup import escape
 from rich.table import Table
 
-from safeswitch import commands, registry, suite
-from safeswitch.console import StageError, answer, console, log, set_output
+from safeswitch import commands, registry, submit_commands, suite
+from safeswitch.console import StageError, answer, console, log
 from safeswitch.interrupts import for_this_process_alone
-
-
-@dataclass
-class Output:
-    """What is shown.
-
-    Attributes:
-        json: put the answer on standard output as one JSON document.
-        quiet: print errors only (and the JSON document, if it is asked for).
-    """
-
-    json: bool = False
-    quiet: bool = False
-
-    def set(self) -> None:
-        """Show no more than what was asked for."""
-        set_output(self.quiet, self.json)
-
-
-@dataclass
-class Common(Output):
-    """Options that every command on runs shares.
-
-    Attributes:
-        profile: how much is run: smoke, standard or full.
-        task: one task only; all tasks where it is left out.
-        jobs: processes at a time (default: the number of cores); results do not depend on it.
-        store: folder of finished work (default: .safeswitch/store in the checkout, or $SAFESWITCH_STORE).
-    """
-
-    profile: str = "standard"
-    task: str | None = None
-    jobs: int | None = None
-    store: Path | None = None
-
-    def runs(self) -> list:
-        """One run per task."""
-        from safeswitch.pipeline import Run
-        from safeswitch.store import Store
-
-        self.set()
-        if self.jobs is not None and self.jobs < 1:
-            raise ValueError(f"--jobs must be at least 1, got {self.jobs}")
-        tasks = [suite.task(self.task)] if self.task else list(suite.TASKS.values())
-        return [Run(task, suite.profile(self.profile), Store(self.store), self.workers) for task in tasks]
-
-    @property
-    def workers(self) -> int:
-        """Processes at a time."""
-        from joblib import cpu_count
-
-        return self.jobs or cpu_count()
+from safeswitch.options import Common, Contestant, Output
 
 
 @dataclass
@@ -79,22 +28,30 @@ class Bench:
 
     Attributes:
         results: where the tables go (default: results/ for the full profile, else results/local/<profile>/).
+        tensorboard: folder for curves of training and CEM, written afterwards; results do not depend on it.
     """
 
     common: tyro.conf.OmitArgPrefixes[Common]
     results: Path | None = None
+    tensorboard: Path | None = None
 
     def run(self) -> None:
         """Do it."""
+        from safeswitch import board
         from safeswitch.publish import default_folder, publish
         from safeswitch.report import write_report
         from safeswitch.summary import announcement, summary
 
+        if self.tensorboard:
+            board.check_installed()
         started, runs = time.perf_counter(), self.common.runs()
         folder = (self.results or default_folder(self.common.profile)).absolute()
         log.print("\n".join(announcement(runs, folder)), markup=False)
         for run in runs:
             publish(run, folder)
+            if self.tensorboard:
+                board.write_training(run, self.tensorboard)
+                log.print(f"curves in [cyan]{board.write_searches(run, self.tensorboard)}[/]")
         write_report(folder)
         data, shown = summary(runs, folder, time.perf_counter() - started)
         answer(data, *shown)
@@ -134,44 +91,47 @@ class Demos:
 
 @dataclass
 class Train:
-    """Train the learners only."""
+    """Train the learners only.
+
+    Attributes:
+        tensorboard: folder for curves of training, written afterwards; results do not depend on it.
+    """
 
     common: tyro.conf.OmitArgPrefixes[Common]
+    tensorboard: Path | None = None
 
     def run(self) -> None:
         """Do it."""
-        folders = {job.label: run.store.folder(job.key) for run in self.common.runs() for job in run.learners}
+        from safeswitch import board
+
+        if self.tensorboard:
+            board.check_installed()
+        runs = self.common.runs()
+        folders = {job.label: run.store.folder(job.key) for run in runs for job in run.learners}
+        if self.tensorboard:
+            for run in runs:
+                log.print(f"curves in [cyan]{board.write_training(run, self.tensorboard)}[/]")
         answer(folders, *(f"{name}: {folder}" for name, folder in folders.items()))
 
 
 @dataclass
 class Evaluate:
-    """Score one method in one cell, exactly, from the handover table.
-
-    Attributes:
-        method: id such as cem@total, or package.module:factory.
-        disturbance: disturbance of the cell.
-        severity: 1 to 5.
-        protocol: onset or start.
-    """
+    """Score one learner and rule, the suite's or your own, in one cell."""
 
     common: tyro.conf.OmitArgPrefixes[Common]
-    method: str = "cem@total"
-    disturbance: str = "cart-mass"
-    severity: int = 3
-    protocol: str = "onset"
+    contestant: tyro.conf.OmitArgPrefixes[Contestant]
 
     def run(self) -> None:
         """Do it."""
-        from safeswitch.evaluate import evaluate
-
+        if self.contestant.learner and not self.common.task:
+            raise ValueError("a learner is for one task: add --task, for example --task cart-pole")
         rows, shown = {}, []
         for run in self.common.runs():
-            row = evaluate(run, self.method, self.disturbance, self.severity, self.protocol)
-            table = Table("score", "value", title=f"{self.method} in {self.disturbance}-{self.severity}")
-            for name, value in row.items():
+            found = self.contestant.evaluate(run)
+            table = Table("score", "value", title=f"{found.run.task.learner} with {found.method} in {found.cell}")
+            for name, value in found.scores.items():
                 table.add_row(str(name), f"{value:.4g}" if isinstance(value, float) else str(value))
-            rows[run.task.name] = row
+            rows[run.task.name] = found.scores
             shown.append(table)
         answer(rows, *shown)
 
@@ -269,7 +229,7 @@ class Play:
 
     Attributes:
         driver: learner, expert, or a method id such as cem@total.
-        disturbance: disturbance of the cell; none for the undisturbed task.
+        disturbance: disturbance of the cell (default: the paper's); none for the undisturbed task.
         severity: 1 to 5.
         seed: episode seed.
         out: file to write, .mp4 or .gif.
@@ -277,7 +237,7 @@ class Play:
 
     common: tyro.conf.OmitArgPrefixes[Common]
     driver: str = "cem@total"
-    disturbance: str = "cart-mass"
+    disturbance: str | None = None
     severity: int = 3
     protocol: str = "onset"
     seed: int = 0
@@ -326,6 +286,9 @@ Command = (
     | Annotated[Demos, tyro.conf.subcommand("demos")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[submit_commands.Submit, tyro.conf.subcommand("submit")]
+    | Annotated[submit_commands.Leaderboard, tyro.conf.subcommand("leaderboard")]
+    | Annotated[submit_commands.Verify, tyro.conf.subcommand("verify")]
     | Annotated[commands.Score, tyro.conf.subcommand("score")]
     | Annotated[commands.Compare, tyro.conf.subcommand("compare")]
     | Annotated[commands.Reference, tyro.conf.subcommand("reference")]

@@ -1,4 +1,4 @@
-"""One method in one cell, one film, and the first gate: what the command line offers besides the whole benchmark."""
+"""One film, and the first gate: what the command line offers besides the whole benchmark and `evaluation`."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ from safeswitch import registry, scoring_stages, stages, suite
 from safeswitch.handover.episode import Episode, NeverSwitch, continue_with_expert, run_episode
 from safeswitch.names import unknown
 from safeswitch.protocols import ARMINGS, Arming
-from safeswitch.scoring.leaderboard import leaderboard
-from safeswitch.scoring.rows import latched_rows
 from safeswitch.scoring.stats import wilson
 from safeswitch.scoring.video import replay_frames, write_side_by_side
 
@@ -21,52 +19,35 @@ if TYPE_CHECKING:
     from safeswitch.pipeline import Run
     from safeswitch.suite import Cell, Task
 
-REFERENCES = ("learner", "expert", "timer")
 GATE = 0.995
 """Share of undisturbed handovers that must succeed before any result of a task means anything."""
 
-
-def find_cell(task: Task, disturbance: str, severity: int) -> Cell:
-    """The task's cell; an unknown one lists the valid ones, nearest first."""
+def find_cell(task: Task, disturbance: str | None, severity: int) -> Cell:
+    """The task's cell, by default its paper's; an unknown one lists the valid ones, nearest first."""
+    disturbance = task.paper_cell.disturbance if disturbance is None else disturbance
     for cell in task.cells:
         if cell.label == disturbance and cell.severity in (severity, 0):
             return cell
     raise unknown("cell", f"{task.name}/{disturbance}-{severity}", map(str, task.cells))
 
 
-def evaluate(run: Run, method_id: str, disturbance: str, severity: int, protocol: str) -> dict[str, Any]:
-    """The leaderboard's row of one latched method in one cell, on the profile's learners and episodes."""
-    arming = _checked_arming(protocol)
-    cell = find_cell(run.task, disturbance, severity)
-    if arming not in scoring_stages.protocols_of(cell):
-        raise ValueError(f"cell {cell} has no onset: score it with --protocol start")
-    method = registry.make_method(method_id)
-    if not method.latched:
-        raise ValueError(f"{method_id} gives control back: run it with bench or play, the table is for latched rules")
-    signal = method_id.partition("@")[2]
-    names = dict.fromkeys([*REFERENCES, *([f"best@{signal}"] if signal else []), method_id])
-    frames = []
-    for seed in range(len(run.learners)):
-        loaded = run.tables_of(seed, cell).load(run.store, run.task, cell)
-        test = scoring_stages.test_panel(loaded, cell, arming)
-        calibration = scoring_stages.calibration_of(loaded, run.task, cell, arming, seed)
-        for name in names:
-            calibrated = registry.make_method(name).calibrate(calibration)
-            if calibrated.rule is None:
-                raise ValueError(f"{name} cannot have what it asks for in cell {cell} under {arming}: the row is blank")
-            rows = latched_rows(test, calibrated)
-            frames.append(scoring_stages.labelled(rows, cell, arming, name, seed, calibrated, ""))
-    table = leaderboard(stages.concat(frames), {run.task.name: run.task_info})
-    return dict(table[table["method"] == method_id].iloc[0])
+def checked_arming(protocol: str) -> Arming:
+    """The arming `protocol`; an unknown one lists the valid ones."""
+    for arming in ARMINGS:
+        if arming == protocol:
+            return arming
+    raise unknown("protocol", protocol, ARMINGS)
 
 
-def play(run: Run, driver: str, disturbance: str, severity: int, protocol: str, seed: int, path: Path) -> Episode:
+def play(
+    run: Run, driver: str, disturbance: str | None, severity: int, protocol: str, seed: int, path: Path
+) -> Episode:
     """Drive one episode and write its film.
 
     Args:
         run: task and profile whose first learner drives.
         driver: learner, expert or a method id.
-        disturbance: of the cell, or none.
+        disturbance: of the cell, or none; None for the paper's.
         severity: 1 to 5.
         protocol: onset or start.
         seed: episode seed.
@@ -74,7 +55,7 @@ def play(run: Run, driver: str, disturbance: str, severity: int, protocol: str, 
     """
     if path.suffix not in (".mp4", ".gif"):
         raise ValueError(f"--out {path}: the file must end in .mp4 or .gif")
-    arming = _checked_arming(protocol)
+    arming = checked_arming(protocol)
     cell = find_cell(run.task, disturbance, severity)
     rule: Any = NeverSwitch()
     queries = False
@@ -154,10 +135,3 @@ def _gate_row(name: str, outcomes: list[list[bool]]) -> dict[str, Any]:
         "lo": float(low),
         "hi": float(high),
     }
-
-
-def _checked_arming(protocol: str) -> Arming:
-    for arming in ARMINGS:
-        if arming == protocol:
-            return arming
-    raise unknown("protocol", protocol, ARMINGS)

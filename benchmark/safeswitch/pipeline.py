@@ -16,7 +16,7 @@ from itertools import product
 
 from joblib import Parallel, delayed, parallel_config
 
-from safeswitch import durations, publish
+from safeswitch import durations, factories, publish
 from safeswitch.console import Progress, StageError
 from safeswitch.scoring.metrics import TaskInfo
 from safeswitch.scoring_stages import episodes_job, signals_job
@@ -96,7 +96,7 @@ class Run:
     @cached_property
     def learners(self) -> list[Job]:
         """One trained learner per learner seed."""
-        demonstrations = self.demonstrations
+        demonstrations = self.demonstrations if factories.wants_demonstrations(self.task.learner) else None
         jobs = [
             learner_job(self.store, self.task, self.profile, seed, demonstrations)
             for seed in range(self.profile.learners)
@@ -159,9 +159,9 @@ class Run:
             for trained, cell in product(self.trained, group):
                 splits: tuple[Split, ...] = ("test", "calibrate") if cell in calibrated_on else ("test",)
                 for split in splits:
-                    count = self.profile.episodes(task, cell, split)
                     twins = chunks.get((trained.seed, task.undisturbed(cell), split), ())
-                    jobs = table_jobs(self.store, task, cell, split, count, trained, twins)
+                    seeds = self.profile.seeds_of(task, cell, split)
+                    jobs = table_jobs(self.store, task, cell, split, seeds, trained, twins)
                     chunks[trained.seed, cell, split] = jobs
                     stage += jobs
             self.finish("handover tables", stage)
@@ -218,11 +218,11 @@ class Run:
     def _further_tables(self) -> dict[tuple[int, Cell], tuple[str, ...]]:
         """Tables of the cells in which only signals are scored; none where only the picture is disturbed."""
         profile = self.profile
-        count = min(profile.signal_episodes, profile.test)
+        seeds = profile.seeds_of(self.task, self.task.none_cell, "test")[: profile.signal_episodes]
         chunks = {
             (trained.seed, cell): []
             if only_seen(cell)
-            else table_jobs(self.store, self.task, cell, "test", count, trained)
+            else table_jobs(self.store, self.task, cell, "test", seeds, trained)
             for trained in self.trained
             for cell in self.task.severities(*profile.signal_severities)
             if not self.task.costly

@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from safeswitch.demos import Demonstrations
     from safeswitch.handover.panel import Calibration
 
@@ -34,9 +36,13 @@ class Driver(IntEnum):
     EXPERT = 1
 
 
+UNSAID: Array = np.full(1, np.nan)
+"""A variance that a learner does not give: signals made from it are NaN, and rules on them are refused."""
+
+
 @dataclass(frozen=True)
 class Prediction:
-    """What a learner says at one step.
+    """What a learner says at one step. Only the action is required: `Prediction(action)`.
 
     Attributes:
         action: (nu,), action units.
@@ -46,8 +52,8 @@ class Prediction:
     """
 
     action: Array
-    epistemic_var: Array
-    aleatoric_var: Array
+    epistemic_var: Array = field(default_factory=lambda: UNSAID)
+    aleatoric_var: Array = field(default_factory=lambda: UNSAID)
     features: NDArray[np.float32] | None = None
 
 
@@ -60,6 +66,37 @@ class Learner(Protocol):
 
     def predict(self, observation: NDArray[Any], step: int) -> Prediction:
         """Predict the action of environment step `step` (0 .. T-1). Called once at every step, in order."""
+
+
+@runtime_checkable
+class LearnerFactory(Protocol):
+    """What makes a learner: what an entry point of `safeswitch.learners` or `--learner package.module:factory` names.
+
+    The least that takes part is a function, and a `Learner` that it returns. It may ask for `demonstrations` (to train)
+    and `seed`, by these names, and must be a function of them:
+
+        def make(demonstrations, seed): ...   # called in every process that needs the learner: right for seconds
+        def make(): ...                       # ready-made, for example from a file of weights beside the module
+
+    What takes longer to train is a class with the three methods below, which is trained once per learner seed and kept
+    in the store as the files that `save` wrote. See docs/add_a_learner.md.
+    """
+
+    @classmethod
+    def train(cls, demonstrations: Demonstrations, seed: int, options: Mapping[str, Any]) -> KeptLearner:
+        """Train: a function of the arguments. `options` are the settings that the suite lists, empty for outsiders."""
+
+    @classmethod
+    def load(cls, folder: Path) -> KeptLearner:
+        """The learner that `save` wrote; it predicts the same bits."""
+
+
+@runtime_checkable
+class KeptLearner(Learner, Protocol):
+    """A learner that can be written to files."""
+
+    def save(self, folder: Path) -> Any:
+        """Write the learner into `folder`, which does not exist yet."""
 
 
 @runtime_checkable
@@ -155,7 +192,9 @@ class SignalContext:
 class SwitchRule(Protocol):
     """Decides the driver of each step from the signals, and from nothing else.
 
-    A rule may have `reads`, ids of the signals that it looks at: in plain episodes the others are then not computed.
+    A class or function that makes one is enough for `--rule package.module:factory`. Three attributes are then looked
+    at, with these defaults: `reads = ()`, ids of the signals that the rule looks at (in plain episodes the others are
+    not computed); `latched = True`, whether it never gives control back; `needs = ()`, as in `Method`.
     """
 
     def reset(self, seed: int) -> None:
@@ -204,7 +243,8 @@ class Method(Protocol):
     """Signal x calibrator x return rule, found by its id (`rule@signal`, or `rule` alone).
 
     `needs` lists what calibration or decision requires beyond the learner: any of "expert-queries", "failures",
-    "rollouts", "privileged". `latched` is False for a rule that may give control back.
+    "rollouts", "privileged". `latched` is False for a rule that may give control back. An optional `reads` lists
+    the ids of signals that it looks at besides the one in its id.
     """
 
     id: str

@@ -9,21 +9,26 @@ The suite's own baselines register exactly as anybody's package does:
 from __future__ import annotations
 
 import importlib
+import inspect
 import re
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from safeswitch.names import unknown
-from safeswitch.protocols import Method, Signal, SignalContext
+from safeswitch.protocols import Calibrated, Method, Signal, SignalContext, SwitchRule
 
-Kind = Literal["learner", "signal", "method"]
+if TYPE_CHECKING:
+    from safeswitch.handover.panel import Calibration
+
+Kind = Literal["learner", "signal", "method", "task"]
 
 GROUPS: dict[Kind, str] = {
     "learner": "safeswitch.learners",
     "signal": "safeswitch.signals",
     "method": "safeswitch.methods",
+    "task": "safeswitch.tasks",
 }
 
 _SMOOTHING = re.compile(r"-[a-z]+[0-9]+$")
@@ -77,6 +82,8 @@ def make_signal(signal_id: str, context: SignalContext | None = None) -> Signal:
 def base_signal(signal_id: str) -> str:
     """Registered name of the signal that `signal_id` smooths, or is: `total` for `total-mean3`."""
     name = signal_id if signal_id in _entries("signal") else _SMOOTHING.sub("", signal_id)
+    if ":" in name:  # somebody's own, not registered
+        return name
     if name not in _entries("signal"):
         raise unknown("signal", name, names("signal"))
     return name
@@ -93,8 +100,54 @@ def has_members(factory: Any) -> bool:
 
 
 def make_method(method_id: str) -> Method:
-    """The method `rule@signal`, or `rule` where the rule looks at no signal."""
-    if ":" in method_id:
-        return find("method", method_id)()
+    """The method `rule@signal`, or `rule` where the rule looks at no signal.
+
+    The factory of a rule that is not registered, `package.module:factory`, is called with the signal if there is one.
+    It may make a bare `SwitchRule`, which then has nothing to calibrate.
+    """
     rule, _, signal = method_id.partition("@")
-    return find("method", rule)(signal or None)
+    factory = find("method", rule)
+    arguments = (signal or None,) if ":" not in rule else (signal,) if signal else ()
+    if ":" in rule:
+        _check_call(rule, factory, arguments)
+    made = factory(*arguments)
+    if hasattr(made, "calibrate"):
+        return made
+    if missing := [name for name in ("reset", "arm", "update") if not hasattr(made, name)]:
+        raise ValueError(
+            f"rule {rule!r} made a {type(made).__name__} without {' and '.join(missing)}: it must be a Method (with "
+            "`calibrate`) or a SwitchRule (with `reset`, `arm` and `update`), see safeswitch.protocols"
+        )
+    return ReadyRule(method_id, made)
+
+
+class ReadyRule:
+    """The method of a bare switch rule: nothing is calibrated.
+
+    Attributes:
+        id: as on the command line.
+        rule: the rule, which may say `latched`, `needs` and `reads` as a method does.
+        needs: what the rule says that it needs.
+        latched: whether it never gives control back: True unless it says otherwise.
+        reads: ids of the signals that it looks at.
+    """
+
+    def __init__(self, id_: str, rule: SwitchRule) -> None:
+        self.id, self.rule = id_, rule
+        self.needs: frozenset[str] = frozenset(getattr(rule, "needs", ()))
+        self.latched = bool(getattr(rule, "latched", True))
+        self.reads: tuple[str, ...] = tuple(getattr(rule, "reads", ()))
+
+    def calibrate(self, calibration: Calibration) -> Calibrated:
+        """The rule as it is."""
+        return Calibrated(self.rule)
+
+
+def _check_call(name: str, factory: Any, arguments: tuple[Any, ...]) -> None:
+    if not callable(factory):
+        raise ValueError(f"rule {name!r} is a {type(factory).__name__}: it must be a class or function that makes one")
+    try:
+        inspect.signature(factory).bind(*arguments)
+    except TypeError as error:
+        hint = f"write {name}@total, for example" if not arguments else f"write {name} without a signal"
+        raise ValueError(f"rule {name!r} cannot be made with {arguments}: {error}; {hint}") from error

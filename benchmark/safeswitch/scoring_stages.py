@@ -38,7 +38,7 @@ SHOWN_CHUNKS = 1
 
 def episodes_job(store: Store, task: Task, cell: Cell, trained: Trained, tables: CellTables, give_back: bool) -> Job:
     """Calibrate every method and score it on the test episodes of one (learner, cell), under both armings."""
-    ids = methods(task.signals)
+    ids = methods(task.rule_signals)
     settings = {"cell": str(cell), "learner_seed": trained.seed, "methods": list(ids), "give_back": give_back}
     rules = {source_of("method", name.partition("@")[0]) for name in ids}
     code = ["safeswitch.handover.panel", "safeswitch.scoring.rows", *sorted(rules)]
@@ -64,7 +64,7 @@ def _score_episodes(
     for protocol in protocols_of(cell):
         test = test_panel(loaded, cell, protocol)
         calibration = calibration_of(loaded, task, cell, protocol, trained.seed)
-        for method_id in methods(task.signals):
+        for method_id in methods(task.rule_signals):
             method: Method = registry.make_method(method_id)
             if not method.latched and not (give_back and protocol == "start"):
                 continue
@@ -74,7 +74,7 @@ def _score_episodes(
             if method.latched:
                 rows = latched_rows(test, calibrated)
             else:
-                rows = _plain_rows(task, cell, trained, test, method, calibrated.rule)
+                rows = plain_rows(task, cell, trained, test, method, calibrated.rule)
             frames.append(labelled(rows, cell, protocol, method_id, trained.seed, calibrated, own))
             logs.update({f"{protocol}|{method_id}|{name}": value for name, value in calibrated.log.items()})
         if others is not None:
@@ -92,7 +92,7 @@ def _left_out_rows(
 ) -> list[pd.DataFrame]:
     """Rows of the latched methods that learn from disturbed episodes, calibrated on those of other disturbances."""
     frames = []
-    for method in map(registry.make_method, methods(task.signals)):
+    for method in map(registry.make_method, methods(task.rule_signals)):
         learns = method.needs & {"failures", "rollouts"} and "privileged" not in method.needs
         calibrated = method.calibrate(calibration) if learns and method.latched else None
         if calibrated is not None and calibrated.rule is not None:
@@ -120,7 +120,7 @@ def calibration_of(
     return Calibration(panel_of(loaded["calibrate"], nominal, protocol), nominal, seed=seed)
 
 
-def _plain_rows(
+def plain_rows(
     task: Task, cell: Cell, trained: Trained, test: Panel, method: Method, rule: Any
 ) -> pd.DataFrame:
     """Rules that give control back have no table: drive the same episodes."""

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import pandas as pd
 
-from safeswitch import demos, registry
+from safeswitch import demos, factories, registry
 from safeswitch.files import load_frame, save_arrays
 from safeswitch.handover.table import HandoverTable, concatenate, join_chunks, record_table
 from safeswitch.protocols import TrainingFeatures
@@ -49,8 +49,8 @@ HANDOVER = ("safeswitch.handover.episode", "safeswitch.handover.outcomes", "safe
 
 
 def source_of(kind: registry.Kind, name: str) -> str:
-    """Package (or module) whose source a registered learner, signal or method depends on."""
-    module = registry.find(kind, name).__module__
+    """Package (or module) whose source a learner, signal or method depends on."""
+    module = name.partition(":")[0] if ":" in name else registry.find(kind, name).__module__
     return module.rpartition(".")[0] or module
 
 
@@ -89,19 +89,30 @@ def _demonstrate(folder: Path, task: Task, settings: dict[str, Any], workers: in
     demos.collect(task.env_id, task.dataset, folder, seeds, n_jobs=workers, **options)
 
 
-def learner_job(store: Store, task: Task, profile: Profile, seed: int, demonstrations: Job) -> Job:
-    """A learner trained on the demonstrations; `seed` draws its initial weights, batches and dropout."""
+def learner_job(store: Store, task: Task, profile: Profile, seed: int, demonstrations: Job | None) -> Job:
+    """A learner trained on the demonstrations; `seed` draws its initial weights, batches and dropout.
+
+    Without demonstrations it is a ready-made one, which is told apart by what it predicts.
+    """
     options = {**task.learner_options, **profile.learner_options}
     settings = {"learner": task.learner, "seed": seed, **options}
-    key = store.key("learner", settings, [demonstrations.key], [source_of("learner", task.learner)])
-    arguments = (task, options, seed, str(store.folder(demonstrations.key)))
+    if demonstrations is None:
+        env = make_env(task, task.none_cell)
+        settings["predictions"] = factories.fingerprint(task.learner, seed, env)
+        env.close()
+    inputs = [] if demonstrations is None else [demonstrations.key]
+    code = [source_of("learner", task.learner)]
+    if not factories.is_kept(registry.find("learner", task.learner)):
+        code.append("safeswitch.factories")  # which then decides what the result holds
+    key = store.key("learner", settings, inputs, code)
+    arguments = (task, options, seed, str(store.folder(demonstrations.key)) if demonstrations else "")
     return Job("learner", f"{task.name} learner {seed}", key, _train, arguments)
 
 
 def _train(folder: Path, task: Task, options: dict[str, Any], seed: int, dataset_root: str) -> None:
-    factory = registry.find("learner", task.learner)
-    learner = factory.train(demos.load(task.dataset, Path(dataset_root)), seed, options)
-    learner.save(folder / "learner")
+    env = make_env(task, task.none_cell)
+    factories.train(folder, task.learner, env, task.dataset, dataset_root, seed, options)
+    env.close()
 
 
 def fits_job(store: Store, task: Task, seed: int, learner: Job, demonstrations: Job) -> Job:
@@ -135,33 +146,34 @@ def table_jobs(
     task: Task,
     cell: Cell,
     split: Split,
-    count: int,
+    seeds: Sequence[int] | int,
     trained: Trained,
     twins: Sequence[Job] = (),
 ) -> list[Job]:
-    """The handover table of one (cell, learner) on the first `count` seeds of a split, in chunks of episodes.
+    """The handover table of one (cell, learner) on episode seeds of a split (or its first ones), in chunks of episodes.
 
     Outcomes are computed here for the cells whose tables are used again and again (`Cell.complete`); elsewhere they
     are computed when a rule first asks for them. Where the disturbance is only seen, those up to the onset are taken
     from `twins`, finished jobs of the undisturbed cell.
     """
     twins = twins if only_seen(cell) else ()
+    seeds = episode_seeds(split, seeds) if isinstance(seeds, int) else seeds
     code = [*PHYSICS, *task.code(), *HANDOVER, source_of("learner", task.learner), *signal_code(task)]
     jobs = []
-    for index, first in enumerate(range(0, count, CHUNK)):
-        size = min(CHUNK, count - first)
+    for index, first in enumerate(range(0, len(seeds), CHUNK)):
+        chunk = list(seeds[first : first + CHUNK])
         twin = [twins[index].key] if twins else []
         settings = {
             "env": task.env_id,
             "cell": cell.env_kwargs,
             "split": split,
-            "seeds": episode_seeds(split, size, first),
+            "seeds": chunk,
             "signals": list(task.signals),
             "complete": cell.complete(split, task.costly),
         }
         key = store.key("table", settings, [*trained.keys, *twin], code)
-        label = f"{cell} {split} {first}-{first + size - 1} (learner {trained.seed})"
-        arguments = (task, cell, split, first, size, trained, [str(store.folder(key)) for key in twin])
+        label = f"{cell} {split} {first}-{first + len(chunk) - 1} (learner {trained.seed})"
+        arguments = (task, cell, split, chunk, trained, [str(store.folder(key)) for key in twin])
         jobs.append(Job("table", label, key, _tabulate, arguments))
     return jobs
 
@@ -171,13 +183,11 @@ def _tabulate(
     task: Task,
     cell: Cell,
     split: Split,
-    first: int,
-    count: int,
+    seeds: Sequence[int],
     trained: Trained,
     twins: Sequence[str],
 ) -> None:
     env = make_env(task, cell)
-    seeds = episode_seeds(split, count, first)
     table = record_table(env, trained.learner(task), trained.signals(task), env.make_expert(), seeds)
     for twin in twins:
         table.share(HandoverTable.load(Path(twin) / "table.npz"))

@@ -255,13 +255,19 @@ def _code_hashes(code: str | Path | Callable[..., Any]) -> Iterator[tuple[str, s
             yield (Path(code.name) / file.relative_to(code)).as_posix(), _sha(file.read_bytes())
     elif isinstance(code, str):
         origin = _module_path(code)
-        if origin.name != "__init__.py":
-            yield code, _sha(origin.read_bytes())
-            return
-        for file in (each for each in _files(origin.parent) if each.suffix == ".py"):
-            yield f"{code}/{file.relative_to(origin.parent).as_posix()}", _sha(file.read_bytes())
+        for file in module_files(code):
+            inside = f"/{file.relative_to(origin.parent).as_posix()}" if origin.name == "__init__.py" else ""
+            yield f"{code}{inside}", _sha(file.read_bytes())
     else:
         yield f"{code.__module__}:{code.__qualname__}", _sha(inspect.getsource(code).encode())
+
+
+def module_files(name: str) -> list[Path]:
+    """Source of a module, or of all modules of a package."""
+    origin = _module_path(name)
+    if origin.name != "__init__.py":
+        return [origin]
+    return [each for each in _files(origin.parent) if each.suffix == ".py"]
 
 
 def _module_path(name: str) -> Path:

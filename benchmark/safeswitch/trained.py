@@ -8,7 +8,9 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from safeswitch import registry
+import gymnasium
+
+from safeswitch import factories, registry
 from safeswitch.files import load_arrays
 from safeswitch.protocols import Signal, SignalContext
 from safeswitch.store import Key
@@ -20,7 +22,7 @@ if TYPE_CHECKING:
 @cache
 def load_learner(task: Task, folder: str) -> Any:
     """The trained learner, loaded once per process."""
-    return registry.find("learner", task.learner).load(Path(folder) / "learner")
+    return factories.load(task.learner, Path(folder), lambda: gymnasium.make(task.env_id).unwrapped)
 
 
 @cache

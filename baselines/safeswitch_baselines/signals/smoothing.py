@@ -82,10 +82,10 @@ class _Source:
 class _Reader:
     """One reader of a `_Source`: all readers are reset before an episode and updated at every step of it."""
 
-    def __init__(self, source: _Source) -> None:
+    def __init__(self, id_: str, source: _Source) -> None:
         self._source = source
         self._steps = 0
-        self.id = source.signal.id
+        self.id = id_  # by which it was asked for: `package.module:factory` for one that is not registered
 
     def reset(self) -> None:
         """Start an episode, of the source too."""
@@ -140,7 +140,7 @@ def make_signal(
     """
     known = {*SIGNALS, *registry.names("signal")} - {"smoothed"} if factories is None else factories
     base, word, length = (signal_id, None, 1) if signal_id in known else split_id(signal_id)
-    if base not in known:
+    if base not in known and ":" not in base:
         raise unknown("signal", base, known)
     factory = (factories or SIGNALS).get(base) or registry.find("signal", base)
     signal = _made(base, factory, context)
@@ -150,10 +150,10 @@ def make_signal(
 def _made(base: str, factory: Callable[..., Signal], context: SignalContext | None) -> Signal:
     """The unsmoothed signal; in a context, a reader of the one that is there already."""
     if context is None:
-        return _new(base, factory, SignalContext())
+        context = SignalContext()
     if base not in context.shared:
         context.shared[base] = _Source(_new(base, factory, context))
-    return _Reader(context.shared[base])
+    return _Reader(base, context.shared[base])
 
 
 def _new(base: str, factory: Callable[..., Signal], context: SignalContext) -> Signal:

@@ -12,7 +12,7 @@ CONTROL_DT = 0.05
 TIMESTEP = 0.005
 """Time step of the simulation [s]: yaw rates agree with those at 0.0025 s to 0.1 %."""
 HORIZON = 100
-"""T, control steps of an episode: 6 s, long enough to meet an obstacle and drive on."""
+"""T, control steps of an episode: 5 s, long enough to meet an obstacle and drive on."""
 SPEED = 4.0
 """[m/s]"""
 SPEED_GAIN = 2.0
