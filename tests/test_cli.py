@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ from micro import MICRO
 from safeswitch import cli, doctor, registry, suite
 from safeswitch.console import console
 from safeswitch.doctor import Check
+from safeswitch.pipeline import STAGES
 
 COMMANDS = ("bench", "report", "demos", "train", "evaluate", "submit", "leaderboard", "verify", "score", "compare")
 COMMANDS += ("reference", "gate", "list", "play", "doctor")
@@ -143,12 +145,17 @@ def test_play_writes_a_film(capsys: Any, micro: list[str], tmp_path: Path) -> No
 def test_bench_writes_the_results(capsys: Any, micro: list[str], tmp_path: Path) -> None:
     code, text = run(capsys, "bench", *micro, "--results", str(tmp_path / "results"))
     assert code == 0, text
-    assert str(tmp_path / "results" / "leaderboard.md") in text
+    assert f"In {tmp_path / 'results'}: leaderboard.md" in text, "where the files are"
     for name in ("leaderboard.csv", "leaderboard.md", "signals.csv", "comparisons.csv", "manifest.json"):
         assert (tmp_path / "results" / name).stat().st_size > 0
     assert (tmp_path / "results" / "figures" / "cart-pole" / "cem-total-onset.png").exists()
     assert (tmp_path / "results" / "tables" / "cart-pole" / "thresholds.csv").exists()
     assert str(tmp_path / "results" / "report.html") in text and (tmp_path / "results" / "report.html").exists()
     before = (tmp_path / "results" / "leaderboard.csv").read_bytes()
-    code, _ = run(capsys, "bench", *micro, "--results", str(tmp_path / "results"))
+    assert "armed at onset" in text and "oracle-hindsight" in text and "manifest.json" in text, "the summary"
+    code = cli.main(["bench", *micro, "--results", str(tmp_path / "results"), "--json"])
     assert code == 0 and (tmp_path / "results" / "leaderboard.csv").read_bytes() == before
+    data = json.loads(capsys.readouterr().out)
+    assert data["results"] == str(tmp_path / "results") and Path(data["files"]["leaderboard.csv"]).is_file()
+    assert {row["method"] for row in data["headline"]} >= {"learner", "expert", "cem@total"}
+    assert set(data["stage_seconds"]["cart-pole"]) <= set(STAGES)

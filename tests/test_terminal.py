@@ -23,7 +23,7 @@ from safeswitch import cli, console, durations, pipeline, suite
 from safeswitch.console import Progress, StageError
 from safeswitch.files import load_json
 from safeswitch.interrupts import for_this_process_alone
-from safeswitch.pipeline import STAGES, Run
+from safeswitch.pipeline import Run
 from safeswitch.scoring.leaderboard import read_csv
 from safeswitch.store import Store
 from safeswitch.summary import announcement, headline
@@ -274,27 +274,23 @@ def test_ctrl_c_is_for_this_process_and_not_for_those_that_it_starts() -> None:
 @needs_terminal
 @pytest.mark.slow
 def test_ctrl_c_on_a_terminal_stops_cleanly_and_the_next_run_goes_on(script: str, tmp_path: Path) -> None:
-    options = ["bench", "--profile", "micro", "--task", "cart-pole", "--jobs", "2", "--store", str(tmp_path / "store")]
-    command = [sys.executable, script, *options, "--results", str(tmp_path / "results")]
-    terminal = Terminal(command)
+    options = ["--profile", "micro", "--task", "cart-pole", "--jobs", "2", "--store", str(tmp_path / "store")]
+    results = tmp_path / "results"
+    terminal = Terminal([sys.executable, script, "bench", *options, "--results", str(results)])
     terminal.read(until=lambda text: "handover tables" in text)
     os.write(terminal.descriptor, b"\x03")
     text = terminal.read()
     assert terminal.exit_code() == 130
     assert "the same command continues where it stopped" in text and "Traceback" not in text
+    assert not results.exists(), "nothing is published half done"
     kept = Store(tmp_path / "store").keys()
     assert {key.partition("-")[0] for key in kept} >= {"demonstrations", "learner"}
-    done = subprocess.run([*command, "--json"], env=environment(), capture_output=True, text=True)
+    train = [sys.executable, script, "train", *options]
+    done = subprocess.run([*train, "--json"], env=environment(), capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    lines = done.stderr.splitlines()
-    stages = Run(TASK, MICRO, Store(tmp_path)).stages
-    assert [line for line in lines if "training" in line] == [f"cart-pole 2/{len(stages)} training: kept from before"]
-    assert not CONTROL.search(done.stderr)
-    shown = [re.match(r"cart-pole (\d)/\d ", line) for line in lines]
-    assert {int(match[1]) for match in shown if match} == set(range(1, len(stages) + 1))
-    data = json.loads(done.stdout)
-    assert data["results"] == str(tmp_path / "results") and Path(data["files"]["leaderboard.csv"]).is_file()
-    assert {row["method"] for row in data["headline"]} >= {"learner", "expert", "cem@total"}
-    assert set(data["stage_seconds"]["cart-pole"]) == set(stages) <= set(STAGES)
-    quiet = subprocess.run([*command, "--quiet"], env=environment(), capture_output=True, text=True)
+    lines = [f"cart-pole {stage}: kept from before" for stage in ("demonstrations", "training")]
+    assert done.stderr.splitlines() == lines and not CONTROL.search(done.stderr)
+    (folder,) = json.loads(done.stdout).values()
+    assert Path(folder).is_dir()
+    quiet = subprocess.run([*train, "--quiet"], env=environment(), capture_output=True, text=True)
     assert (quiet.returncode, quiet.stdout, quiet.stderr) == (0, "", "")
