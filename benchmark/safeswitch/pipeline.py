@@ -46,6 +46,7 @@ STAGES = (
     "scores",
     "CEM seeds",
     "figures",
+    "published tables",
 )
 """Every stage by the name under which it is shown, in order."""
 
@@ -278,11 +279,12 @@ class Run:
 
     @property
     def stages(self) -> tuple[str, ...]:
-        """Names of the stages from demonstrations to figures, in the order in which `publish` computes them."""
+        """Names of the stages that `publish` goes through, in order."""
         further = self.task.severities(*self.profile.signal_severities)
         left_out = {
             "signal fits": not fitted_signals(self.task),
             "further severities": all(only_seen(cell) for cell in further),
+            "published tables": not self.profile.tables,
         }
         return tuple(stage for stage in STAGES if not left_out.get(stage))
 

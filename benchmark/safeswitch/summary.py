@@ -123,4 +123,5 @@ def summary(runs: Sequence[Run], folder: Path, seconds: float) -> tuple[dict[str
     }
     width = max(map(len, found))
     lines = [f"  {name:<{width}}  {about}" for name, about in found.items()]
-    return data, [headline_table(rows), f"Done in {duration(seconds)}. In {folder}:", *lines]
+    first = folder / next(name for name in ("report.html", *FILES) if name in found)
+    return data, [headline_table(rows), f"Done in {duration(seconds)}. In {folder}:", *lines, f"Open {first}"]
