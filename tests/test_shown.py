@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from safeswitch.handover.shown import shown_traces
+from safeswitch.handover.shown import JUDGED, shown_traces
 from safeswitch.handover.table import HandoverTable, record_table
 from safeswitch.protocols import Array, Prediction
 from safeswitch.tasks.cart_pole_image import CartPoleImageEnv
+from safeswitch.tasks.rally_car_image import RallyCarImageEnv
 
 pytestmark = pytest.mark.rendering
 
@@ -30,6 +31,16 @@ class Brightness:
         action = np.array([0.5 * (side + self._before)])
         self._before = side
         return Prediction(action, action**2, np.zeros(1), observation.ravel()[:8].astype(np.float32))
+
+
+class Straight:
+    """Steers nowhere."""
+
+    def reset(self, seed: int) -> None:
+        pass
+
+    def predict(self, observation: NDArray[Any], step: int) -> Prediction:
+        return Prediction(np.zeros(1), np.zeros(1), np.zeros(1))
 
 
 class Seen:
@@ -57,7 +68,9 @@ def test_before_the_onset_it_is_the_recorded_signal_and_afterwards_it_is_not() -
     table = recorded()
     for name in ("object", "pixel-noise", "lighting"):
         env = CartPoleImageEnv(name, 5)
-        traces, visible = shown_traces(env, Brightness(), [Seen()], table)
+        shown = shown_traces(env, Brightness(), [Seen()], table)
+        traces, visible = shown.traces, shown.visible
+        assert np.isnan(shown.distance).all() and np.array_equal(shown.judged, visible)
         for episode, seed in enumerate(table.seeds):
             env.reset(seed=int(seed))
             onset, length = env.onset, int(table.length[episode])
@@ -72,7 +85,7 @@ def test_before_the_onset_it_is_the_recorded_signal_and_afterwards_it_is_not() -
 def test_it_is_what_the_learner_would_say_if_it_did_not_react() -> None:
     """Driven by the recorded actions, the disturbed task visits the undisturbed states."""
     table = recorded()
-    traces, _ = shown_traces(CartPoleImageEnv("object", 5), Brightness(), [Seen()], table)
+    traces = shown_traces(CartPoleImageEnv("object", 5), Brightness(), [Seen()], table).traces
     env, twin, signal, learner = CartPoleImageEnv("object", 5), CartPoleImageEnv(), Seen(), Brightness()
     for each in (env, twin):
         each.reset(seed=SEEDS[0])
@@ -96,6 +109,20 @@ def test_tables_that_hold_no_undisturbed_states_are_refused() -> None:
         shown_traces(env, Brightness(), [Seen()], recorded().take(np.array([0])))
     with pytest.raises(ValueError, match="disturbed ones"):
         shown_traces(env, Brightness(), [Seen()], recorded("object"))
+
+
+def test_an_obstacle_is_shown_on_states_of_undisturbed_episodes() -> None:
+    """A placed disturbance: its kind, its distance, and frames that are judged only where it is neither near nor far."""
+    plain = RallyCarImageEnv(horizon=60)
+    table = record_table(plain, Straight(), [Seen()], plain.make_expert(), SEEDS[:2])
+    shown = shown_traces(RallyCarImageEnv("obstacle", 3, horizon=60), Straight(), [Seen()], table)
+    assert set(shown.kinds) <= {"box", "barrel", "ball", "slab"}
+    assert np.all(np.diff(shown.distance[0, : int(table.length[0])]) < 0.0)  # it comes nearer
+    assert not (shown.judged & ~shown.visible).any()
+    judged = shown.distance[shown.judged]
+    assert ((judged >= JUDGED[0]) & (judged <= JUDGED[1])).all()
+    before = np.cumsum(shown.visible, axis=1) == 0
+    np.testing.assert_array_equal(shown.traces["seen"][before], table.signals["seen"][before])
 
 
 def test_outcomes_up_to_the_onset_are_those_of_the_undisturbed_twin() -> None:
