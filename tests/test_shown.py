@@ -112,7 +112,7 @@ def test_tables_that_hold_no_undisturbed_states_are_refused() -> None:
 
 
 def test_an_obstacle_is_shown_on_states_of_undisturbed_episodes() -> None:
-    """A placed disturbance: its kind, its distance, and frames that are judged only where it is neither near nor far."""
+    """A placed disturbance: its kind, its distance, and frames judged only where it is neither near nor far."""
     plain = RallyCarImageEnv(horizon=60)
     table = record_table(plain, Straight(), [Seen()], plain.make_expert(), SEEDS[:2])
     shown = shown_traces(RallyCarImageEnv("obstacle", 3, horizon=60), Straight(), [Seen()], table)
