@@ -201,6 +201,7 @@ class Run:
             else table_jobs(self.store, self.task, cell, "test", count, trained)
             for trained in self.trained
             for cell in self.task.severities(*profile.signal_severities)
+            if not self.task.costly
         }
         if chunks:
             self.finish("further severities", [job for jobs in chunks.values() for job in jobs])
