@@ -37,7 +37,7 @@ SHOWN_CHUNKS = 1
 
 def episodes_job(store: Store, task: Task, cell: Cell, trained: Trained, tables: CellTables, give_back: bool) -> Job:
     """Calibrate every method and score it on the test episodes of one (learner, cell), under both armings."""
-    ids = methods(task.signals)
+    ids = methods(task.rule_signals)
     settings = {"cell": str(cell), "learner_seed": trained.seed, "methods": list(ids), "give_back": give_back}
     rules = {source_of("method", name.partition("@")[0]) for name in ids}
     code = ["safeswitch.handover.panel", "safeswitch.scoring.rows", *sorted(rules)]
@@ -62,7 +62,7 @@ def _score_episodes(
     for protocol in protocols_of(cell):
         test = test_panel(loaded, cell, protocol)
         calibration = calibration_of(loaded, task, cell, protocol, trained.seed)
-        for method_id in methods(task.signals):
+        for method_id in methods(task.rule_signals):
             method: Method = registry.make_method(method_id)
             if not method.latched and not (give_back and protocol == "start"):
                 continue
@@ -90,7 +90,7 @@ def _left_out_rows(
 ) -> list[pd.DataFrame]:
     """Rows of the latched methods that learn from disturbed episodes, calibrated on those of other disturbances."""
     frames = []
-    for method in map(registry.make_method, methods(task.signals)):
+    for method in map(registry.make_method, methods(task.rule_signals)):
         learns = method.needs & {"failures", "rollouts"} and "privileged" not in method.needs
         calibrated = method.calibrate(calibration) if learns and method.latched else None
         if calibrated is not None and calibrated.rule is not None:

@@ -92,6 +92,7 @@ class Task:
         showcase: signals that the figures show besides the paper's.
         literal: the learner as the paper describes it, where it is not the one above; it is reported beside it.
         literal_options: overrides of its configuration.
+        ruled: signals that switch rules run on; all of them where it is empty.
         others: most learners of other seeds that an ensemble asks beside its own; None for all of them.
         costly: whether an outcome takes so long that a run must do without some: cells after the first three then have
             half the episodes, and no cell has rows that leave its disturbance out or rules that give control back.
@@ -110,8 +111,14 @@ class Task:
     showcase: tuple[str, ...] = ()
     literal: str = ""
     literal_options: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    ruled: tuple[str, ...] = ()
     others: int | None = None
     costly: bool = False
+
+    @property
+    def rule_signals(self) -> tuple[str, ...]:
+        """Signals that switch rules run on."""
+        return tuple(signal for signal in self.ruled or self.signals if signal in self.signals)
 
     @property
     def paper_cell(self) -> Cell:
@@ -208,16 +215,15 @@ def _cart_pole_image_cells() -> tuple[Cell, ...]:
 
 
 def _rally_car_image_cells() -> tuple[Cell, ...]:
-    name, others = "rally-car-image", ("mud", "dusk", "camera-dirt", "camera-pitch", "steering-bias")
+    name, others = "rally-car-image", ("mud", "dusk", "camera-dirt", "steering-bias")
     return (
         Cell(name, "obstacle", 3, "paper"),
         Cell(name, "none", 0, "none"),
         Cell(name, "roadside", 3, "benign"),
-        *(Cell(name, "obstacle", severity, "paper") for severity in (1, 2, 4, 5)),
+        *(Cell(name, "obstacle", severity, "paper") for severity in (1, 5)),
         Cell(name, "obstacle-held-out", 3, "held-out"),
         Cell(name, "obstacle", 3, "held-out", track="hollow"),
         Cell(name, "none", 0, "none", track="hollow"),
-        Cell(name, "puddle-paint", 3, "benign"),
         *(Cell(name, other, 3, "other") for other in others),
     )
 
@@ -323,6 +329,7 @@ TASKS: dict[str, Task] = {
         ),
         assets=("rally_car", "common"),
         showcase=("ensemble-mean3", "mahalanobis"),
+        ruled=("epistemic", "aleatoric", "total", "total-mean3", "ensemble-mean3", "mahalanobis"),
         others=2,
         costly=True,
     ),
