@@ -135,11 +135,11 @@ def _contest(part: pd.DataFrame) -> str:
 def _cells(rows: pd.DataFrame, paper: tuple[str, int] | None) -> list[str]:
     """A section per cell, the paper's first and open, the others folded."""
     keys = sorted({(str(d), int(s)) for d, s in zip(rows["disturbance"], rows["severity"], strict=True)})
-    keys.sort(key=lambda key: (key != paper, key[0] != "none"))
+    keys.sort(key=lambda key: (key != paper, key[0].partition("@")[0] != "none"))
     lines: list[str] = []
     for disturbance, severity in keys:
         cell = rows[(rows["disturbance"] == disturbance) & (rows["severity"] == severity)]
-        title = disturbance if disturbance == "none" else f"{disturbance}, severity {severity}"
+        title = disturbance if disturbance.partition("@")[0] == "none" else f"{disturbance}, severity {severity}"
         folded = (disturbance, severity) != paper
         lines += [f"<details><summary><b>{title}</b></summary>", ""] if folded else [f"### {title}", ""]
         for protocol, part in cell.groupby("protocol", sort=True):

@@ -134,7 +134,7 @@ def _check_pairs(frame: pd.DataFrame, order: list[str]) -> None:
     if repeated.any():
         first = frame.loc[repeated, order].iloc[0].to_dict()
         raise ValueError(f"{int(repeated.sum())} episodes occur twice, the first: {first}")
-    start = frame[(frame["protocol"] == "start") & (frame["disturbance"] != "none")]
+    start = frame[(frame["protocol"] == "start") & ~frame["disturbance"].str.fullmatch("none(@.*)?")]
     if start.empty:
         return
     twins = start.groupby([*row_key(frame), "learner", "seed"], sort=False, dropna=False).size()
