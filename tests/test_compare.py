@@ -95,7 +95,7 @@ def test_the_spread_of_cem_is_compared_as_a_range(folders: tuple[Path, Path]) ->
 def test_folders_that_cannot_be_compared(folders: tuple[Path, Path], tmp_path: Path, capsys: Any) -> None:
     a, b = folders
     assert cli.main(["compare", str(a), str(tmp_path / "missing")]) == 2
-    assert "no result folder" in capsys.readouterr().out
+    assert "no result folder" in capsys.readouterr().err
     write_csv(board("cart-pole-image"), b / "leaderboard.csv")
     with pytest.raises(ValueError, match="other tasks"):
         compare(a, b)

@@ -118,7 +118,7 @@ def test_unknown_outcomes_leave_a_cell_out_with_the_reason(folder: Path, tmp_pat
 )
 def test_bad_input(folder: Path, capsys: Any, arguments: list[str], message: str) -> None:
     assert cli.main(["score", "--tables", str(folder), *arguments]) == 2
-    assert message in " ".join(capsys.readouterr().out.split())
+    assert message in " ".join(capsys.readouterr().err.split())
 
 
 def test_tables_without_calibrate_episodes_say_what_to_do(folder: Path, tmp_path: Path) -> None:

@@ -256,18 +256,22 @@ def test_a_setting_that_a_stage_refuses_is_bad_input(tmp_path: Path, monkeypatch
 
 @pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals")
 def test_ctrl_c_is_for_this_process_and_not_for_those_that_it_starts() -> None:
-    with for_this_process_alone():
-        sleeper = "import time; print('up', flush=True); time.sleep(60)"
-        child = subprocess.Popen([sys.executable, "-c", sleeper], stdout=subprocess.PIPE)
-        assert child.stdout is not None and child.stdout.readline() == b"up\n"
-        child.send_signal(signal.SIGINT)
-        time.sleep(0.2)
-        assert child.poll() is None, "it does not hear SIGINT"
-        with pytest.raises(KeyboardInterrupt):
-            os.kill(os.getpid(), signal.SIGINT)
-            time.sleep(5)
-        child.kill()
-        child.wait()
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # test workers ignore it
+    try:
+        with for_this_process_alone():
+            sleeper = "import time; print('up', flush=True); time.sleep(60)"
+            child = subprocess.Popen([sys.executable, "-c", sleeper], stdout=subprocess.PIPE)
+            assert child.stdout is not None and child.stdout.readline() == b"up\n"
+            child.send_signal(signal.SIGINT)
+            time.sleep(0.2)
+            assert child.poll() is None, "it does not hear SIGINT"
+            with pytest.raises(KeyboardInterrupt):
+                os.kill(os.getpid(), signal.SIGINT)
+                time.sleep(5)
+            child.kill()
+            child.wait()
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
 
