@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from pathlib import Path
 from typing import Any
@@ -17,13 +18,10 @@ version = release = safeswitch.__version__
 extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
-    "sphinx.ext.autosummary",
     "sphinx.ext.mathjax",
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
 ]
-exclude_patterns = ["_templates"]
-templates_path = ["_templates"]
 myst_enable_extensions = ["colon_fence", "deflist"]
 myst_heading_anchors = 3
 
@@ -34,11 +32,9 @@ html_css_files = ["wide.css"]
 html_theme_options = {"navigation_with_keys": True}
 
 # ---- API pages, from the docstrings
-autosummary_generate = True
-autosummary_ignore_module_all = False
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
-autodoc_default_options = {"members": True, "show-inheritance": True}
+autodoc_default_options = {"members": True, "show-inheritance": True, "ignore-module-all": True}  # each at its home
 default_role = "code"
 napoleon_google_docstring = True
 napoleon_numpy_docstring = False
@@ -65,6 +61,9 @@ def _plain(app: Any, what: str, name: str, thing: Any, options: Any, lines: list
             continue
         parts = re.split(r"(``.*?``|`[^`]*`|:\w+:`[^`]*`)", rest)
         parts[::2] = [re.sub(r"([*|])|(?<=\w)(_)(?=\W|$)", r"\\\g<0>", part) for part in parts[::2]]
+        for literal, after in zip(range(1, len(parts), 2), parts[2::2], strict=True):
+            if re.match(r"\w", after):  # a plural such as `Panel`s
+                parts[literal] += "\\ "
         lines[i] = start + "".join(parts)
 
 
@@ -90,14 +89,47 @@ def _outside(app: Any, docname: str, source: list[str]) -> None:
 
     def link(match: re.Match[str]) -> str:
         text, target = match[1], match[2]
+        if "://" in target or target.startswith("#"):
+            return match[0]
+        if docname in ("contributing", "changelog"):  # they stand a folder higher
+            target = target.removeprefix("docs/") if target.startswith("docs/") else f"../{target}"
         if target in included:
             return f"[{text}]({included[target]})"
-        return f"{text} (`{target.removeprefix('../')}` in the repository)" if target.startswith("../") else match[0]
+        if target.startswith("../"):
+            return f"{text} (`{target.removeprefix('../')}` in the repository)"
+        return f"[{text}]({target})"
 
     if docname == "index":  # patterns for pages that not every version has
         lines = source[0].splitlines(keepends=True)
         source[0] = "".join(line for line in lines if not re.fullmatch(r"\w+\*\n", line) or _matches(line.strip()))
     source[0] = re.sub(r"(?<!!)\[([^\]]+)\]\(([^)\s]+)\)", link, source[0])
+
+
+def _write_api(app: Any) -> None:
+    """One page a module below docs/api, which git ignores: every module is there without being listed anywhere."""
+    folder, pages = Path(__file__).parent / "api", {}
+    for root in (ROOT / "benchmark" / "safeswitch", ROOT / "baselines" / "safeswitch_baselines"):
+        for path in sorted(root.rglob("*.py")):
+            parts = path.relative_to(root.parent).with_suffix("").parts
+            name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+            if not parts[-1].startswith("__main__"):
+                pages[name] = path
+    for name in pages:
+        below = [each for each in pages if each.rpartition(".")[0] == name]
+        lines = [f"# {name}", "", "```{eval-rst}", f".. automodule:: {name}", "```", ""]
+        if below:
+            lines += ["## Modules", "", *(f"* [{each}]({each}.md): {_summary(pages[each])}" for each in below), ""]
+            lines += ["```{toctree}", ":hidden:", "", *below, "```", ""]
+        page, text = folder / f"{name}.md", "\n".join(lines)
+        if not page.exists() or page.read_text() != text:  # unchanged pages are not read again
+            folder.mkdir(exist_ok=True)
+            page.write_text(text)
+    for stale in set(folder.glob("*")) - {folder / f"{name}.md" for name in pages}:
+        stale.unlink()
+
+
+def _summary(path: Path) -> str:
+    return (ast.get_docstring(ast.parse(path.read_text())) or "").partition("\n")[0].replace("*", "\\*")
 
 
 def _matches(pattern: str) -> bool:
@@ -106,6 +138,7 @@ def _matches(pattern: str) -> bool:
 
 def setup(app: Any) -> None:
     """Hooks of this site."""
+    app.connect("builder-inited", _write_api)
     app.connect("autodoc-process-docstring", _plain, priority=900)  # after napoleon
     app.connect("source-read", _outside)
     app.connect("include-read", lambda app, relative, parent, content: _outside(app, parent, content))
