@@ -34,6 +34,8 @@ html_theme_options = {"navigation_with_keys": True}
 # ---- API pages, from the docstrings
 autodoc_member_order = "bysource"
 autodoc_typehints = "signature"
+autodoc_typehints_format = "short"
+autodoc_type_aliases = {name: name for name in ("Array", "Bools", "Ints")}  # by name, not spelled out
 autodoc_default_options = {"members": True, "show-inheritance": True, "ignore-module-all": True}  # each at its home
 default_role = "code"
 napoleon_google_docstring = True
@@ -46,8 +48,18 @@ nitpick_ignore_regex = [
 ]
 
 
+_COLON = "\ue000"  # of the private use area: in no docstring
+
+
+def _sentence(app: Any, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+    """Hide a colon in the sentence about an attribute from napoleon, which takes what is before it for the type."""
+    if what in ("attribute", "data", "property") and lines:
+        lines[0] = lines[0].replace(":", _COLON)
+
+
 def _plain(app: Any, what: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
     """Escape what reStructuredText takes for markup in a docstring that is plain text, outside of literal text."""
+    lines[:] = [line.replace(_COLON, ":") for line in lines]
     if any(line.startswith("## ") for line in lines):  # written in Markdown, with tables: shown as it is
         body = lines.index("") if "" in lines else len(lines)
         lines[body:] = ["", ".. code-block:: text", "", *(f"   {line}" for line in lines[body:]), ""]
@@ -139,6 +151,7 @@ def _matches(pattern: str) -> bool:
 def setup(app: Any) -> None:
     """Hooks of this site."""
     app.connect("builder-inited", _write_api)
-    app.connect("autodoc-process-docstring", _plain, priority=900)  # after napoleon
+    app.connect("autodoc-process-docstring", _sentence, priority=100)  # before napoleon
+    app.connect("autodoc-process-docstring", _plain, priority=900)  # and after it
     app.connect("source-read", _outside)
     app.connect("include-read", lambda app, relative, parent, content: _outside(app, parent, content))

@@ -27,7 +27,7 @@ BLOCK = re.compile(r"^(?P<indent> *)```(?P<language>\w*)\n(?P<code>.*?)^(?P=inde
 SHELL = ("sh", "bash", "console", "shell")
 RUN = ("safeswitch list", "safeswitch list --json", "make help")
 """Commands in shell blocks that cost nothing and are run."""
-OUTSIDE = {"pip", "git", "cd", "export", "python", "jupyter", "tensorboard", "pytest", "pre-commit", "mkdir", "cat"}
+OUTSIDE = {"pip", "git", "cd", "export", "python", "jupyter", "tensorboard", "pytest", "pre-commit", "cat", "true"}
 
 pytestmark = pytest.mark.skipif(not (ROOT / "pyproject.toml").is_file(), reason="needs the checkout")
 
@@ -67,7 +67,7 @@ def test_python_blocks_run(page: Path, tmp_path: Path) -> None:
 def commands(page: Path) -> list[list[str]]:
     """Commands of the shell blocks of a page, as words without comments and leading assignments."""
     lines = [line for block in blocks(page, *SHELL) for line in block.replace("\\\n", " ").splitlines()]
-    parts = [part.removeprefix("$ ") for line in lines for part in re.split(r" && | \| ", line)]
+    parts = [part.removeprefix("$ ") for line in lines for part in re.split(r" && | \|\|? ", line)]
     split = [shlex.split(part, comments=True) for part in parts]
     return [words for words in map(without_assignments, split) if words]
 
