@@ -104,7 +104,7 @@ def test_something_new_is_seen_and_nothing_else(learner: DropoutVGGLearner) -> N
     """The excess channels of new frames of the same scene are nearly empty, those of frames with a patch are not."""
     frames, labels, episodes = images(50, 3), np.zeros((50, 1)), np.zeros(50, np.int64)
     pool = [Pool.read(Demonstrations(each, labels, episodes), [0], 1) for each in (frames, with_patch(frames))]
-    encoder = Encoder(learner.encoding, 1, 50, torch.device("cpu"), 1.0)
+    encoder = Encoder(learner.encoding, 1, 50, torch.device("cpu"))
     plain, patched = (encoder(each, torch.arange(50))[:, 3:].abs().mean().item() for each in pool)
     assert patched > 20 * plain
 
@@ -113,7 +113,7 @@ def test_a_decision_sees_what_training_saw(learner: DropoutVGGLearner) -> None:
     """The stack that a decision encodes frame by frame is the one that training encodes in batches."""
     frames = with_patch(images(6, 4))
     pool = Pool.read(Demonstrations(frames, np.zeros((6, 1)), np.zeros(6, np.int64)), [0], 1)
-    encoded = Encoder(learner.encoding, 1, 6, torch.device("cpu"), learner.config.excess_gain)(pool, torch.arange(6))
+    encoded = Encoder(learner.encoding, 1, 6, torch.device("cpu"))(pool, torch.arange(6))
     learner.reset(0)
     for index, frame in enumerate(frames):
         torch.testing.assert_close(learner._stack.push(frame)[0], encoded[index], rtol=1e-4, atol=1e-4)

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from safeswitch.names import unknown
+
 Split = Literal["train", "design", "calibrate", "pilot", "test", "kept-back"]
 Tag = Literal["paper", "none", "benign", "held-out", "other"]
 
@@ -114,6 +116,14 @@ class Task:
     def none_cell(self) -> Cell:
         """The undisturbed cell."""
         return next(cell for cell in self.cells if cell.tag == "none")
+
+    def find(self, disturbance: str | None, severity: int, cells: tuple[Cell, ...]) -> Cell:
+        """One of `cells`, by default of the paper's disturbance; an unknown one lists the valid ones, nearest first."""
+        disturbance = self.paper_cell.disturbance if disturbance is None else disturbance
+        for cell in cells:
+            if cell.label == disturbance and cell.severity in (severity, 0):
+                return cell
+        raise unknown("cell", f"{self.name}/{disturbance}-{severity}", map(str, cells))
 
     def undisturbed(self, cell: Cell) -> Cell:
         """The cell of the undisturbed twins of a cell's episodes."""

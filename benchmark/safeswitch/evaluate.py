@@ -24,11 +24,7 @@ GATE = 0.995
 
 def find_cell(task: Task, disturbance: str | None, severity: int) -> Cell:
     """The task's cell, by default its paper's; an unknown one lists the valid ones, nearest first."""
-    disturbance = task.paper_cell.disturbance if disturbance is None else disturbance
-    for cell in task.cells:
-        if cell.label == disturbance and cell.severity in (severity, 0):
-            return cell
-    raise unknown("cell", f"{task.name}/{disturbance}-{severity}", map(str, task.cells))
+    return task.find(disturbance, severity, task.cells)
 
 
 def checked_arming(protocol: str) -> Arming:

@@ -218,6 +218,8 @@ class Run:
 
     def _further_tables(self) -> dict[tuple[int, Cell], tuple[str, ...]]:
         """Tables of the cells in which only signals are scored; none where only the picture is disturbed."""
+        if self.task.costly:
+            return {}
         profile = self.profile
         seeds = profile.seeds_of(self.task, self.task.none_cell, "test")[: profile.signal_episodes]
         chunks = {
@@ -226,7 +228,6 @@ class Run:
             else table_jobs(self.store, self.task, cell, "test", seeds, trained)
             for trained in self.trained
             for cell in self.task.severities(*profile.signal_severities)
-            if not self.task.costly
         }
         if chunks:
             self.finish("further severities", [job for jobs in chunks.values() for job in jobs])

@@ -17,6 +17,7 @@ import pandas as pd
 
 from safeswitch import demos, factories, registry
 from safeswitch.files import load_frame, save_arrays
+from safeswitch.handover.outcomes import UNKNOWN
 from safeswitch.handover.table import HandoverTable, concatenate, join_chunks, record_table
 from safeswitch.protocols import TrainingFeatures
 from safeswitch.store import Key, Store
@@ -216,7 +217,10 @@ def complete_job(store: Store, task: Task, cell: Cell, recorded: tuple[str, ...]
 
 
 def _complete(folder: Path, root: str, task: Task, cell: Cell, recorded: tuple[str, ...]) -> None:
-    table = load_table(Store(Path(root)), task, cell, recorded)
+    table = recorded_table(Store(Path(root)), recorded)
+    if (table.known() == UNKNOWN).any():  # the simulator takes seconds to make
+        env = make_env(task, cell)
+        table.attach(env, env.make_expert())
     table.complete().save(folder / "table.npz", snapshots=False)
 
 

@@ -153,6 +153,7 @@ TASKS: dict[str, Task] = {
         modules=(
             "safeswitch.tasks.cart_pole",
             "safeswitch.tasks.cart_pole_image",
+            "safeswitch.tasks.image_env",
             "safeswitch.tasks.rendering",
             "safeswitch.tasks.visual",
             "safeswitch.expert.cart_pole_model",
@@ -188,6 +189,7 @@ TASKS: dict[str, Task] = {
         modules=(
             "safeswitch.tasks.car_geometry",
             "safeswitch.tasks.course",
+            "safeswitch.tasks.image_env",
             "safeswitch.tasks.placing",
             "safeswitch.tasks.rally_car",
             "safeswitch.tasks.rally_car_config",

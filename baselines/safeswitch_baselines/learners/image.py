@@ -31,14 +31,13 @@ class FrameStack:
     Args:
         encoding: of a stack.
         frames: F.
-        gain: factor of the excess.
     """
 
-    def __init__(self, encoding: PixelEncoding, frames: int, gain: float = 1.0) -> None:
+    def __init__(self, encoding: PixelEncoding, frames: int) -> None:
         height, width, self._depth = encoding.observation_shape
         self._differences = encoding.change is not None
         self._scale, self._offset = encoding.factors(frames)
-        self._excess = encoding.excess(gain)
+        self._excess = encoding.excess()
         self._frames = np.zeros((height, width, frames * self._depth), np.float32)
         channels = (frames + (self._excess is not None)) * self._depth
         self._encoded = np.zeros((1, height, width, channels), np.float32)
@@ -79,7 +78,7 @@ class DropoutVGGLearner(TrainedLearner[DropoutVGG, PixelEncoding, VGGConfig]):
         """Build what `predict` needs from the model."""
         config = self.config
         height, width, _ = self.encoding.observation_shape
-        self._stack = FrameStack(self.encoding, config.frames, config.excess_gain)
+        self._stack = FrameStack(self.encoding, config.frames)
         self._head = FrozenLayers(self.model.linears(), config.head_rates, config.samples, config.shared_trunk)
         self._masks = MaskStream(config.layout(height, width), config.samples)
 

@@ -86,18 +86,15 @@ class Encoder:
         frames: F.
         rows: largest batch.
         device: where the stacks go.
-        gain: factor of the excess.
     """
 
-    def __init__(
-        self, encoding: PixelEncoding, frames: int, rows: int, device: torch.device, gain: float = 1.0
-    ) -> None:
+    def __init__(self, encoding: PixelEncoding, frames: int, rows: int, device: torch.device) -> None:
         height, width, depth = encoding.observation_shape
         self._scale, self._offset = (torch.from_numpy(value).to(device) for value in encoding.factors(frames))
         self._differences = encoding.change is not None
         self._frames = torch.empty(rows, frames * depth, height, width, dtype=torch.uint8)
         self._pixels = torch.empty(rows, height, width, frames * depth, dtype=torch.uint8)
-        self._excess = encoding.excess(gain, device)
+        self._excess = encoding.excess(device)
         self._images = frames * depth
         channels = self._images + (self._excess is not None) * depth
         self._encoded = torch.empty(rows, height, width, channels, device=device)
@@ -175,8 +172,7 @@ def fit(
 ) -> History:
     """Train `model` in place on the episodes `training`; `held_out` are for validation and may be empty."""
     place = next(model.parameters()).device
-    most = max(config.batch_size, EVALUATION_BATCH)
-    encoders = [Encoder(encoding, config.frames, most, place, config.excess_gain) for _ in range(2)]
+    encoders = [Encoder(encoding, config.frames, max(config.batch_size, EVALUATION_BATCH), place) for _ in range(2)]
     layout = config.layout(*encoding.observation_shape[:2])
     bits = np.random.PCG64DXSM(seed_sequence(seed, "training-masks"))
     optimiser = make_optimiser(model, config)
@@ -266,8 +262,7 @@ def evaluate(model: DropoutVGG, encoder: Encoder, pool: Pool) -> tuple[float, fl
 
 def trunk_features(model: DropoutVGG, encoding: PixelEncoding, demos: Demonstrations) -> NDArray[np.float32]:
     """Features (n, d) of every step, an episode at a time, without dropout."""
-    place, gain = next(model.parameters()).device, model.config.excess_gain
-    encoder = Encoder(encoding, model.config.frames, EVALUATION_BATCH, place, gain)
+    encoder = Encoder(encoding, model.config.frames, EVALUATION_BATCH, next(model.parameters()).device)
     features = []
     with one_thread(), torch.inference_mode():
         for episode in np.unique(demos.episodes):

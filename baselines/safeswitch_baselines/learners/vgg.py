@@ -167,6 +167,7 @@ class PixelEncoding:
         change: (H, W, C), float32; None where frames enter as they are.
         components: (k, d), float32, principal components of standardised frames; None where there are none.
         reach: (d,), float32, what is hardly ever left of a training frame without them.
+        gain: (1,), float32, factor of what exceeds it.
     """
 
     scale: NDArray[np.float32]
@@ -174,6 +175,7 @@ class PixelEncoding:
     change: NDArray[np.float32] | None = None
     components: NDArray[np.float32] | None = None
     reach: NDArray[np.float32] | None = None
+    gain: NDArray[np.float32] | None = None
 
     @classmethod
     def fit(cls, episodes: Iterable[NDArray[np.uint8]], config: VGGConfig) -> PixelEncoding:
@@ -205,7 +207,7 @@ class PixelEncoding:
 
     def arrays(self) -> dict[str, NDArray[np.float32]]:
         """Scale and offset, and what else is used."""
-        names = ("scale", "offset", "change", "components", "reach")
+        names = ("scale", "offset", "change", "components", "reach", "gain")
         parts = {name: getattr(self, name) for name in names}
         return {name: value for name, value in parts.items() if value is not None}
 
@@ -220,13 +222,14 @@ class PixelEncoding:
                 yield halved(torch.addcmul(offset, torch.from_numpy(frames).float(), scale))
 
         subspace = Subspace.fit(standardised, config.components, REACH_FLOOR)
-        return replace(self, components=subspace.components, reach=subspace.reach)
+        gain = np.array([config.excess_gain], np.float32)
+        return replace(self, components=subspace.components, reach=subspace.reach, gain=gain)
 
-    def excess(self, gain: float, device: torch.device | str = "cpu") -> Excess | None:
+    def excess(self, device: torch.device | str = "cpu") -> Excess | None:
         """What computes the excess of standardised frames; None where there is none."""
-        if self.components is None or self.reach is None:
+        if self.components is None or self.reach is None or self.gain is None:
             return None
-        return Excess(Subspace(self.components, self.reach), gain, device)
+        return Excess(Subspace(self.components, self.reach), float(self.gain[0]), device)
 
     def factors(self, frames: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Scale and offset (H, W, F C) of a whole stack, oldest first, after differences were taken."""

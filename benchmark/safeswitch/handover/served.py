@@ -114,10 +114,4 @@ def _panel(
 
 def find_cell(task: Task, disturbance: str | None, severity: int) -> Cell:
     """A cell of the task at any severity; an unknown one lists the valid ones, nearest first."""
-    if disturbance is None:
-        disturbance = task.paper_cell.disturbance
-    cells = (*task.cells, *task.severities(1, 2, 3, 4, 5))
-    for cell in cells:
-        if cell.label == disturbance and cell.severity in (severity, 0):
-            return cell
-    raise unknown("cell", f"{task.name}/{disturbance}-{severity}", map(str, cells))
+    return task.find(disturbance, severity, (*task.cells, *task.severities(1, 2, 3, 4, 5)))

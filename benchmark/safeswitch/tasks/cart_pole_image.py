@@ -8,29 +8,23 @@ object is only seen: it touches nothing, and the expert, which knows the full st
 from __future__ import annotations
 
 from types import MappingProxyType
-from typing import Any
 
 import gymnasium as gym
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from safeswitch.tasks import models
 from safeswitch.tasks.cart_pole import CartPoleEnv
-from safeswitch.tasks.disturbances import Disturbance
-from safeswitch.tasks.rendering import Renderer
+from safeswitch.tasks.image_env import ImageEnv
 
 SIZE = 64
 """Width and height of a frame [pixel]."""
-OVERSAMPLING = 2
-"""A pixel is the mean of this number squared of rendered ones: where an edge lies within a pixel can then be seen, and
-with it how fast the pole moves. Cheaper than multisampling by the driver."""
 CAMERA = "third_person"
 RAIL = 1.0
 """Half the length of the rail [m]: all of it is in the picture, and a pixel is 3.4 cm."""
 
 
-class CartPoleImageEnv(CartPoleEnv):
+class CartPoleImageEnv(ImageEnv, CartPoleEnv):
     """Swing the pole up from hanging, and keep it upright without leaving the rail, from pictures alone.
 
     Dynamics and success are those of `SafeSwitch/CartPole-v0`, on a rail of +-1 m.
@@ -72,7 +66,8 @@ class CartPoleImageEnv(CartPoleEnv):
     """
 
     task = "cart-pole-image"
-    camera = CAMERA
+    camera = eye = CAMERA
+    eye_size = (SIZE, SIZE)
     defaults = MappingProxyType({"rail": RAIL})
 
     def __init__(
@@ -87,28 +82,6 @@ class CartPoleImageEnv(CartPoleEnv):
         """See the class docstring."""
         super().__init__(disturbance, severity, render_mode, width, height, **design)
         self.observation_space = gym.spaces.Box(0, 255, (SIZE, SIZE, 3), np.uint8)
-        self._eye: Renderer | None = None
-
-    def close(self) -> None:
-        """Free both renderers; the environment keeps working and makes new ones."""
-        super().close()
-        if self._eye is not None:
-            self._eye.close()
-            self._eye = None
 
     def _compiled(self) -> mujoco.MjModel:
         return models.cart_pole_image(self.config)
-
-    def _observe(self, disturbance: Disturbance | None) -> NDArray[Any]:
-        if self._eye is None:
-            side = OVERSAMPLING * SIZE
-            self._eye = Renderer(self.simulator.nominal, side, side, CAMERA, fast=True)
-        picture = shrink(self._draw(self._eye, disturbance))
-        return picture if disturbance is None else disturbance.sense(picture, self._step_index)
-
-
-def shrink(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Picture (2 h, 2 w, 3) at half the size: the mean of each block of four pixels, rounded."""
-    wide = picture.astype(np.uint16)
-    rows = wide[0::2] + wide[1::2]
-    return ((rows[:, 0::2] + rows[:, 1::2] + 2) >> 2).astype(np.uint8)

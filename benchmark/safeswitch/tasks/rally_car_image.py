@@ -12,18 +12,15 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from safeswitch.tasks.cart_pole_image import shrink
 from safeswitch.tasks.disturbances import Disturbance
+from safeswitch.tasks.image_env import ImageEnv
 from safeswitch.tasks.rally_car import Array, RallyCarEnv
-from safeswitch.tasks.rendering import Renderer
 
 HEIGHT, WIDTH = 48, 96
 """Of a frame [pixel]."""
-OVERSAMPLING = 2
-"""A pixel is the mean of this number squared of rendered ones."""
 
 
-class RallyCarImageEnv(RallyCarEnv):
+class RallyCarImageEnv(ImageEnv, RallyCarEnv):
     """Keep the whole car on the track and touch nothing, steering from the picture of the onboard camera alone.
 
     ## Observation: `Box(48, 96, 3)`, uint8
@@ -65,6 +62,8 @@ class RallyCarImageEnv(RallyCarEnv):
 
     task = "rally-car-image"
     steering_only = True
+    eye = "onboard"
+    eye_size = (HEIGHT, WIDTH)
 
     def __init__(
         self,
@@ -79,14 +78,6 @@ class RallyCarImageEnv(RallyCarEnv):
         """See the class docstring."""
         super().__init__(disturbance, severity, render_mode, width, height, track, **design)
         self.observation_space = gym.spaces.Box(0, 255, (HEIGHT, WIDTH, 3), np.uint8)
-        self._eye: Renderer | None = None
-
-    def close(self) -> None:
-        """Free both renderers; the environment keeps working and makes new ones."""
-        super().close()
-        if self._eye is not None:
-            self._eye.close()
-            self._eye = None
 
     def _throttle(self, action: Array) -> float:
         w, x, y, z = self._qpos[3:7].tolist()
@@ -95,13 +86,7 @@ class RallyCarImageEnv(RallyCarEnv):
         return float(min(max(self.config.speed_gain * (self.config.speed - v_x), -1.0), 1.0))
 
     def _observe(self, disturbance: Disturbance | None) -> NDArray[Any]:
-        if self._eye is None:
-            size = OVERSAMPLING * WIDTH, OVERSAMPLING * HEIGHT
-            self._eye = Renderer(self.simulator.nominal, *size, "onboard", fast=True)
-        picture = shrink(self._draw(self._eye, disturbance))
-        if disturbance is not None:
-            picture = disturbance.sense(picture, self._step_index)
-        return self._noisy(picture)
+        return self._noisy(super()._observe(disturbance))
 
     def _noisy(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The picture with the camera's noise, which depends on episode and step alone."""
