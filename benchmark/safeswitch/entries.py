@@ -46,10 +46,10 @@ class Cell:
         """Whether thresholds are also calibrated on the other disturbances: severity 3 of what does harm."""
         return self.severity == 3 and self.tag in ("paper", "other")
 
-    def complete(self, split: Split, costly: bool) -> bool:
+    def complete(self, split: Split) -> bool:
         """Whether every outcome is computed in advance: tables that many rules, and cells, come back to."""
-        often = self.left_out and split == "calibrate" and not costly
-        return self.tag == "none" or (self.tag == "paper" and self.severity == 3) or often
+        often = self.left_out and split == "calibrate"
+        return (self.tag == "none" and not self.track) or (self.tag == "paper" and self.severity == 3) or often
 
     @property
     def env_kwargs(self) -> dict[str, Any]:
@@ -79,9 +79,9 @@ class Task:
         ruled: signals that switch rules run on; all of them where it is empty.
         spared: names of cells that no profile runs, to save time; `evaluate` and `play` take them.
         others: most learners of other seeds that an ensemble asks beside its own; None for all of them.
-        costly: whether an outcome takes so long that a run must do without some: cells after the first three then have
-            half the episodes, signals are scored at the severities of the cells alone, and no cell has rows that leave
-            its disturbance out or rules that give control back.
+        costly: whether an episode takes so long that a run must do without some: cells after the first three then have
+            half the episodes and no method that trains a network or asks for every outcome, signals are scored at the
+            severities of the cells alone, and rules that give control back are run in the paper's cell only.
     """
 
     name: str

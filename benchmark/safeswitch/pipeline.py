@@ -173,7 +173,7 @@ class Run:
                 keys[seed, task.undisturbed(task.calibrated_on(cell)), "calibrate"],
                 keys[seed, cell, "test"],
                 keys[seed, task.undisturbed(cell), "test"],
-                tuple((other, keys[seed, other, "calibrate"]) for other in others(cell, cells) if not task.costly),
+                tuple((other, keys[seed, other, "calibrate"]) for other in others(cell, cells)),
             )
             for seed in range(len(self.learners))
             for cell in cells
@@ -276,7 +276,8 @@ class Run:
         return run
 
     def _gives_back(self, cell: object) -> bool:
-        return cell in self.task.cells[: self.profile.give_back_cells] and not self.task.costly
+        count = self.profile.give_back_cells
+        return cell in self.task.cells[: min(count, 1) if self.task.costly else count]
 
     @property
     def stages(self) -> tuple[str, ...]:

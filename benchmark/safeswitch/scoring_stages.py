@@ -38,7 +38,7 @@ SHOWN_CHUNKS = 1
 
 def episodes_job(store: Store, task: Task, cell: Cell, trained: Trained, tables: CellTables, give_back: bool) -> Job:
     """Calibrate every method and score it on the test episodes of one (learner, cell), under both armings."""
-    ids = methods(task.rule_signals)
+    ids = methods_in(task, cell)
     settings = {"cell": str(cell), "learner_seed": trained.seed, "methods": list(ids), "give_back": give_back}
     rules = {source_of("method", name.partition("@")[0]) for name in ids}
     code = ["safeswitch.handover.panel", "safeswitch.scoring.rows", *sorted(rules)]
@@ -46,6 +46,12 @@ def episodes_job(store: Store, task: Task, cell: Cell, trained: Trained, tables:
     key = store.key("episodes", settings, [*trained.keys, *tables.keys], code, [*LIBRARIES, *optional])
     arguments = (str(store.root), task, cell, trained, tables, give_back)
     return Job("episodes", f"{cell} learner {trained.seed}", key, _score_episodes, arguments)
+
+
+def methods_in(task: Task, cell: Cell) -> tuple[str, ...]:
+    """Methods that run in a cell: all but, where an episode is costly, those that `Task.costly` names."""
+    spared = {*OPTIONAL, "simplex"} if task.costly and cell not in task.cells[:3] else set()
+    return tuple(name for name in methods(task.rule_signals) if name not in spared)
 
 
 def _score_episodes(
@@ -64,7 +70,7 @@ def _score_episodes(
     for protocol in protocols_of(cell):
         test = test_panel(loaded, cell, protocol)
         calibration = calibration_of(loaded, task, cell, protocol, trained.seed)
-        for method_id in methods(task.rule_signals):
+        for method_id in methods_in(task, cell):
             method: Method = registry.make_method(method_id)
             if not method.latched and not (give_back and protocol == "start"):
                 continue
@@ -79,7 +85,7 @@ def _score_episodes(
             logs.update({f"{protocol}|{method_id}|{name}": value for name, value in calibrated.log.items()})
         if others is not None:
             nominal = loaded["calibrate_nominal"]
-            twins = nominal.take(np.tile(np.arange(len(nominal)), len(others) // len(nominal)))
+            twins = nominal.take(np.searchsorted(nominal.seeds, others.seeds))  # seeds of a split are increasing
             left_out = Calibration(panel_of(others, twins, protocol), nominal, seed=trained.seed)
             frames += _left_out_rows(task, cell, trained, test, left_out)
     save_frame(folder / "episodes.npz", concat(frames))
@@ -92,7 +98,7 @@ def _left_out_rows(
 ) -> list[pd.DataFrame]:
     """Rows of the latched methods that learn from disturbed episodes, calibrated on those of other disturbances."""
     frames = []
-    for method in map(registry.make_method, methods(task.rule_signals)):
+    for method in map(registry.make_method, methods_in(task, cell)):
         learns = method.needs & {"failures", "rollouts"} and "privileged" not in method.needs
         calibrated = method.calibrate(calibration) if learns and method.latched else None
         if calibrated is not None and calibrated.rule is not None:

@@ -170,7 +170,7 @@ def table_jobs(
             "split": split,
             "seeds": chunk,
             "signals": list(task.signals),
-            "complete": cell.complete(split, task.costly),
+            "complete": cell.complete(split),
         }
         key = store.key("table", settings, [*trained.keys, *twin], code)
         label = f"{cell} {split} {first}-{first + len(chunk) - 1} (learner {trained.seed})"
@@ -192,7 +192,7 @@ def _tabulate(
     table = record_table(env, trained.learner(task), trained.signals(task), env.make_expert(), seeds)
     for twin in twins:
         table.share(HandoverTable.load(Path(twin) / "table.npz"))
-    if cell.complete(split, task.costly):
+    if cell.complete(split):
         table.complete()
     table.save(folder / "table.npz")
     env.close()

@@ -35,7 +35,7 @@ class Episode:
         onset: step t0 of the disturbance, -1 when undisturbed; T when the disturbance never came into view.
         arming_step: first step at which the rule was asked.
         length: steps executed; < T after an early failure.
-        success: the task's criterion at the end.
+        success: the task's criterion at the end; never where the expert found no finite plan at some step.
         driver: (T,) int8, `Driver` of each step.
         actions: (T, nu), executed actions in action units.
         states: (T + 1, nx), full states, SI units.
@@ -143,7 +143,7 @@ def run_episode(
     traces = {signal.id: np.full(horizon, np.nan) for signal in signals}
     snapshots = [env.snapshot()] if record_snapshots else []
     states[0] = env.state
-    driver, previous = Driver.LEARNER, None
+    driver, previous, failed_before = Driver.LEARNER, None, solver_failures(expert)
     while not env.done:
         step = env.step_index
         observation = env.observe()
@@ -171,17 +171,27 @@ def run_episode(
     length = env.step_index
     onset = -1 if env.onset is None else env.onset
     armed_from = arming_step(env.onset, arming, horizon)
+    success = env.is_success and solver_failures(expert) == failed_before
     return Episode(
-        seed, onset, armed_from, length, env.is_success, driven, actions, states, traces, _stack(snapshots, horizon)
+        seed, onset, armed_from, length, success, driven, actions, states, traces, _stack(snapshots, horizon)
     )
 
 
 def continue_with_expert(env: TaskEnv, expert: Expert) -> bool:
-    """Let the expert drive from the current state, planning from scratch, to the end. True on success."""
+    """Let the expert drive from the current state, planning from scratch, to the end.
+
+    True on success: the task's criterion, and a finite plan at every step.
+    """
     expert.reset()
+    before = solver_failures(expert)
     while not env.done:
         env.advance(expert.action(env.state, env.parameters))
-    return env.is_success
+    return env.is_success and solver_failures(expert) == before
+
+
+def solver_failures(expert: Expert | None) -> int:
+    """How often an expert has found no finite plan; 0 for one that does not count it (attribute `fallbacks`)."""
+    return getattr(expert, "fallbacks", 0)
 
 
 def _expert_action(env: TaskEnv, expert: Expert | None, driven: NDArray[Any], step: int) -> Array:

@@ -13,13 +13,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from safeswitch.handover.episode import continue_with_expert
+from safeswitch.handover.episode import continue_with_expert, solver_failures
 from safeswitch.protocols import Array, Expert
 
 if TYPE_CHECKING:
     from safeswitch.tasks.base import TaskEnv
 
-UNKNOWN = -1
+UNKNOWN, FAILURE, SUCCESS, SOLVER_FAILURE = -1, 0, 1, 2
+"""What stands in a table. The last is a failure too, kept apart so that it can be listed: at a step or more the expert
+found no finite plan."""
 
 
 class Continuation:
@@ -36,13 +38,16 @@ class Continuation:
         self.env, self.expert, self.seeds, self.snapshots = env, expert, seeds, snapshots
         self._current = -1
 
-    def __call__(self, episode: int, step: int) -> bool:
-        """o(step) of an episode."""
+    def __call__(self, episode: int, step: int) -> int:
+        """o(step) of an episode: `SUCCESS`, `FAILURE` or `SOLVER_FAILURE`."""
         if episode != self._current:
             self.env.reset(seed=int(self.seeds[episode]))
             self._current = episode
         self.env.restore(self.snapshots[episode, step])
-        return continue_with_expert(self.env, self.expert)
+        before = solver_failures(self.expert)
+        if continue_with_expert(self.env, self.expert):
+            return SUCCESS
+        return FAILURE if solver_failures(self.expert) == before else SOLVER_FAILURE
 
 
 @dataclass
@@ -50,12 +55,12 @@ class Outcomes:
     """What is known of o(s) for E episodes.
 
     Attributes:
-        known: (E, T + 1) int8: 1 success, 0 failure, -1 not computed yet.
+        known: (E, T + 1) int8: `SUCCESS`, `FAILURE`, `SOLVER_FAILURE`, or `UNKNOWN`: not computed yet.
         resolve: computes one entry; None where no simulator is at hand.
     """
 
     known: NDArray[np.int8]
-    resolve: Callable[[int, int], bool] | None = None
+    resolve: Callable[[int, int], int] | None = None
 
     def __call__(self, episodes: NDArray[np.int64], steps: NDArray[np.int64]) -> NDArray[np.bool_]:
         """o(s) for pairs (n,), (n,) of episode and handover step.
@@ -73,4 +78,4 @@ class Outcomes:
             for episode, step in np.unique(np.stack([episodes[missing], steps[missing]]), axis=1).T:
                 self.known[episode, step] = self.resolve(int(episode), int(step))
             values = self.known[episodes, steps]
-        return values == 1
+        return values == SUCCESS

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from safeswitch.handover.outcomes import SUCCESS, UNKNOWN
 from safeswitch.handover.table import Bools, HandoverTable, Ints
 from safeswitch.names import unknown
 from safeswitch.protocols import ARMINGS, Arming, Array, Driver, SwitchRule
@@ -130,9 +131,24 @@ class Panel:
     def best_threshold(self, name: str, phi: float = PHI) -> tuple[float, float]:
         """Threshold with the highest mean return on these episodes, and that return (the lowest such threshold)."""
         thresholds = self.candidate_thresholds(name)
-        returns = self.returns(self.handover_at(name, thresholds), phi).mean(axis=1)
-        best = int(np.argmax(returns))
-        return float(thresholds[best]), float(returns[best])
+        best, value = self.best_of(self.handover_at(name, thresholds), phi)
+        return float(thresholds[best]), value
+
+    def best_of(self, handover: Ints, phi: float = PHI) -> tuple[int, float]:
+        """Row of handover steps (n, E) with the highest mean return, the first of equal ones, and that return.
+
+        Only outcomes that can change the answer are asked for: as long as they are unknown they count as a success, and
+        those of the row that looks best are computed until the best row has no unknown ones.
+        """
+        episodes = np.arange(len(self))
+        earned = self.armed_learner_steps(handover) / self.table.horizon
+        while True:
+            known = self.table.known()[episodes, handover]
+            returns = (earned + phi * ((known == SUCCESS) | (known == UNKNOWN))).mean(axis=1)
+            best = int(np.argmax(returns))
+            if (known[best] != UNKNOWN).all():
+                return best, float(returns[best])
+            self.success(handover[best])
 
     def margins(self, name: str, phi: float = PHI) -> tuple[float, float]:
         """Thresholds between which a constant threshold is worth having: the run of thresholds around the best one
@@ -167,16 +183,13 @@ class Panel:
         """
         horizon = self.table.horizon
         coarse = np.append(np.arange(0, horizon, DELAY_STEP), horizon)
-        best = int(coarse[self._best_of(coarse, phi)])
+        best = int(coarse[self.best_of(self.delayed(coarse), phi)[0]])
         near = np.arange(max(best - DELAY_STEP + 1, 0), min(best + DELAY_STEP, horizon + 1))
-        return int(near[self._best_of(near, phi)]), np.union1d(coarse, near)
+        return int(near[self.best_of(self.delayed(near), phi)[0]]), np.union1d(coarse, near)
 
     def delayed(self, delays: NDArray[np.integer]) -> Ints:
         """(n, E) handover step of handing every episode over n delays after its arming step; T where it has ended."""
         return self.executed(np.minimum(self.arming_step + np.asarray(delays)[:, None], self.table.horizon))
-
-    def _best_of(self, delays: Ints, phi: float) -> int:
-        return int(np.argmax(self.returns(self.delayed(delays), phi).mean(axis=1)))
 
 
 @dataclass(frozen=True)

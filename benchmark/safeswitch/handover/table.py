@@ -85,7 +85,10 @@ class HandoverTable:
         return self
 
     def known(self) -> NDArray[np.int8]:
-        """(E, T + 1) what is known: 1 success, 0 failure, -1 not computed; the learner alone from `length` on."""
+        """(E, T + 1) what is known: 1 success, 0 failure, 2 failure of the expert's solver, -1 not computed.
+
+        From `length` on it is what the learner does alone.
+        """
         known = np.stack([self.sources[source].known[row] for source, row in zip(self.source, self.row, strict=True)])
         ended = np.arange(self.horizon + 1)[None, :] >= self.length[:, None]
         return np.where(ended, self.learner_success[:, None], known).astype(np.int8)
@@ -192,7 +195,7 @@ def new_table(
     outcome: NDArray[np.int8],
     snapshots: Array | None = None,
 ) -> HandoverTable:
-    """A table with outcomes of its own, (E, T + 1): 1, 0 or -1 (unknown)."""
+    """A table with outcomes of its own, (E, T + 1), coded as in `Outcomes`."""
     count = len(seeds)
     source, row = np.zeros(count, np.int64), np.arange(count)
     outcomes = (Outcomes(np.array(outcome, np.int8)),)

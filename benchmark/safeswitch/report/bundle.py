@@ -11,6 +11,7 @@ import pandas as pd
 
 from safeswitch import registry
 from safeswitch.files import load_json
+from safeswitch.handover.outcomes import SUCCESS, UNKNOWN
 from safeswitch.handover.panel import Panel
 from safeswitch.handover.table import HandoverTable
 from safeswitch.pictures import STORY
@@ -135,7 +136,7 @@ def _add_table(pack: Pack, cell: str, table: HandoverTable) -> None:
     pack.add(f"{cell}/length", table.length, "int16")
     pack.add(f"{cell}/alone", table.learner_success, "uint8")
     known = table.known()
-    pack.add(f"{cell}/outcome", np.where(known < 0, 2, known), "uint8")
+    pack.add(f"{cell}/outcome", np.where(known == UNKNOWN, 2, known == SUCCESS), "uint8")
     if (known[table.disturbed] >= 0).all():
         pack.add(f"{cell}/first", np.nan_to_num(table.t_first, nan=-1), "int16")
         pack.add(f"{cell}/last", np.nan_to_num(table.t_last, nan=-1), "int16")
