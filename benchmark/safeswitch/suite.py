@@ -162,6 +162,7 @@ TASKS: dict[str, Task] = {
         showcase=("ensemble-mean3", "mahalanobis"),
         literal="paper-literal",
         literal_options=VGG,
+        costly=True,
     ),
     "rally-car-image": Task(
         name="rally-car-image",

@@ -13,6 +13,7 @@ on a plant: candidates x episodes.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -143,10 +144,19 @@ def _as_arrays(rows: list[tuple[Array, Array, Array, float, float, bool]]) -> di
 
 
 class CEM(SignalMethod):
-    """`cem@signal`: the learned threshold."""
+    """`cem@signal`: the learned threshold.
+
+    Args:
+        signal: id of the signal.
+        changes: fields of `CEMSettings` that are not to be as in `settings`, to see what they matter.
+    """
 
     family = "cem"
     needs = frozenset({"failures", "rollouts"})
+
+    def __init__(self, signal: str | None, **changes: Any):
+        super().__init__(signal)
+        self.changes = changes
 
     def settings(self, arming: Arming) -> CEMSettings:
         """Free parameters under an arming: under `start`, half of the episodes of an iteration are undisturbed."""
@@ -155,7 +165,8 @@ class CEM(SignalMethod):
     def calibrate(self, calibration: Calibration) -> Calibrated:
         """Algorithm 1 on the calibrate episodes."""
         panel = calibration.panel
-        return learn_threshold(panel, self.signal, self.settings(panel.arming), calibration.seed, calibration.phi)
+        settings = replace(self.settings(panel.arming), **self.changes)
+        return learn_threshold(panel, self.signal, settings, calibration.seed, calibration.phi)
 
 
 class CEMHigh(CEM):

@@ -183,6 +183,7 @@ class VectorRule:
 
     def __init__(self, score: Score):
         self.score = score
+        self.reads = score.baseline.names
         self._driver = Driver.LEARNER
 
     def reset(self, seed: int) -> None:

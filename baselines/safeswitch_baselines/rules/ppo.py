@@ -65,7 +65,7 @@ class PolicyRule:
     def __init__(
         self, signals: Sequence[str], scale: Scale, layers: Sequence[tuple[Array, Array]], history: int = HISTORY
     ) -> None:
-        self.signals, self.scale, self.layers = tuple(signals), scale, list(layers)
+        self.reads, self.scale, self.layers = tuple(signals), scale, list(layers)
         self._seen: deque[Array] = deque(maxlen=history)
         self._driver = Driver.LEARNER
 
@@ -81,7 +81,7 @@ class PolicyRule:
     def update(self, step: int, signals: Mapping[str, float]) -> Driver:
         """The more likely action, LEARNER in a tie; EXPERT for good."""
         if self._driver is Driver.LEARNER:
-            self._seen.append(self.scale(np.array([signals[name] for name in self.signals])))
+            self._seen.append(self.scale(np.array([signals[name] for name in self.reads])))
             missing = (self._seen.maxlen or 0) - len(self._seen)
             value = np.concatenate([self._seen[0]] * missing + list(self._seen))
             for weight, bias in self.layers[:-1]:
