@@ -7,8 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from safeswitch.handover.outcomes import SOLVER_FAILURE, UNKNOWN
 from safeswitch.handover.panel import Calibration, Panel
 from safeswitch.handover.table import HandoverTable, concatenate, new_table
+from safeswitch.scoring.failures import failure_table
+from safeswitch.suite import Cell
 from safeswitch_baselines.rules.base import DelayRule, ThresholdRule
 from safeswitch_baselines.rules.bounds import OracleHindsight
 from synthetic import HORIZON, random_table
@@ -151,3 +154,40 @@ def test_unknown_outcomes_without_a_simulator_are_an_error():
     table = new_table(np.arange(1), np.array([1]), np.array([5]), np.array([False]), {}, np.full((1, HORIZON + 1), -1))
     with pytest.raises(LookupError, match="without a simulator"):
         table.outcome(np.array([0]), np.array([2]))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10_000), st.sampled_from(["onset", "start"]), st.sampled_from([0.5, 5.0]))
+def test_the_best_row_is_found_without_asking_for_every_outcome(seed, arming, phi):
+    whole = random_table(seed)
+    truth, asked = whole.known(), []
+    hidden = np.where(np.arange(HORIZON + 1) < whole.length[:, None], UNKNOWN, truth)
+    lazy = new_table(whole.seeds, whole.onset, whole.length, whole.learner_success, whole.signals, hidden)
+
+    def resolve(episode, step):
+        asked.append((episode, step))
+        return int(truth[episode, step])
+
+    lazy.sources[0].resolve = resolve
+    complete, panel = Panel(whole, arming), Panel(lazy, arming)
+    rows = complete.handover_at("total", complete.candidate_thresholds("total"))
+    means = complete.returns(rows, phi).mean(axis=1)
+    assert panel.best_of(rows, phi) == (int(np.argmax(means)), float(means.max()))
+    assert len(asked) == len(set(asked))
+    # A row whose return would be too low even with success everywhere is never asked about.
+    hopeless = complete.armed_learner_steps(rows).mean(axis=1) / HORIZON + phi < means.max() - 1e-9
+    needed = {(e, s) for row in rows[~hopeless] for e, s in enumerate(row)}
+    assert set(asked) <= needed
+
+
+def test_the_solvers_failures_are_failures_and_are_listed():
+    outcome = np.ones((2, HORIZON + 1), np.int8)
+    outcome[0, 3], outcome[0, 4], outcome[1, 5] = SOLVER_FAILURE, 0, SOLVER_FAILURE
+    length = np.array([HORIZON, 4])  # the second ends before the step at which the solver would have failed
+    alone = np.array([True, False])
+    table = new_table(np.array([7, 8]), np.array([2, 2]), length, alone, {}, outcome)
+    assert not Panel(table, "onset").success(np.array([3, 3]))[0] and Panel(table, "onset").success(np.array([3, 3]))[1]
+    row = failure_table([(Cell("cart-pole", "push", 3, "other"), 1, table)]).iloc[0]
+    assert row[["episodes", "learner_failures", "learner_early_ends"]].tolist() == [2, 1, 1]
+    assert row[["outcomes", "expert_failures", "solver_failures"]].tolist() == [HORIZON + 4, 2, 1]
+    assert row["solver_failure_seeds"] == "7"

@@ -15,11 +15,14 @@ import pandas as pd
 
 from safeswitch.scoring.leaderboard import read_csv
 
-KEY = ["task", "disturbance", "severity", "protocol", "method", "signal", "reference", "learner", "calibrated_on"]
+KEY = [
+    "task", "disturbance", "severity", "protocol", "method", "signal", "reference", "learner", "calibrated_on",
+    "parameter", "value",
+]  # fmt: skip
 """Columns that say which row it is, those that a table has."""
 TABLES = (
     "leaderboard.csv", "left_out.csv", "signals.csv", "comparisons.csv", "paper_literal_leaderboard.csv",
-    "paper_literal_signals.csv", "cem_seeds.csv",
+    "paper_literal_signals.csv", "cem_seeds.csv", "sensitivity.csv", "failures.csv",
 )  # fmt: skip
 SAME, OVERLAP, DIFFERS = "same", "overlap", "differs"
 

@@ -20,6 +20,7 @@ from safeswitch import durations, factories, publish
 from safeswitch.console import Progress, StageError
 from safeswitch.scoring.metrics import TaskInfo
 from safeswitch.scoring_stages import episodes_job, signals_job
+from safeswitch.sensitivity import SAMPLES, latency_job, samples_job, varied_job
 from safeswitch.stages import (
     CHUNK,
     CellTables,
@@ -45,6 +46,7 @@ STAGES = (
     "signal quality",
     "scores",
     "CEM seeds",
+    "sensitivity",
     "figures",
     "published tables",
 )
@@ -252,6 +254,25 @@ class Run:
         return jobs
 
     @cached_property
+    def varied(self) -> list[Job]:
+        """Thresholds learned with one thing changed, per learner, and for some learners with other K; none by default.
+
+        The last one times decisions.
+        """
+        if not self.profile.sensitivity:
+            return []
+        tables = {trained.seed: self.tables[trained.seed, str(self.task.paper_cell)] for trained in self.trained}
+        jobs = [varied_job(self.store, self.task, each, tables[each.seed]) for each in self.trained]
+        jobs += [
+            samples_job(self.store, self.task, self.profile, each, samples)
+            for each in self.trained[: self.profile.sensitivity]
+            for samples in SAMPLES
+        ]
+        jobs.append(latency_job(self.store, self.task, self.trained[0], tables[0]))
+        self.finish("sensitivity", jobs)
+        return jobs
+
+    @cached_property
     def figures(self) -> Job:
         """Figures and video of the first learner in the paper's cell."""
         cell = str(self.task.paper_cell)
@@ -287,6 +308,7 @@ class Run:
             "signal fits": not fitted_signals(self.task),
             "further severities": all(only_seen(cell) for cell in further),
             "published tables": not self.profile.tables,
+            "sensitivity": not self.profile.sensitivity,
         }
         return tuple(stage for stage in STAGES if not left_out.get(stage))
 

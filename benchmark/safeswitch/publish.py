@@ -10,6 +10,7 @@ import platform
 import shutil
 import subprocess
 import time
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from itertools import product
 from pathlib import Path
@@ -25,6 +26,7 @@ from safeswitch.handover.published import file_name, write_table
 from safeswitch.handover.table import HandoverTable
 from safeswitch.report.views import tables_in
 from safeswitch.scoring.comparisons import paired_comparisons
+from safeswitch.scoring.failures import failure_table
 from safeswitch.scoring.leaderboard import leaderboard, merge_task_rows, read_csv, write_csv
 from safeswitch.scoring.left_out import left_out_lines, left_out_table
 from safeswitch.scoring.markdown import write_markdown
@@ -34,6 +36,7 @@ from safeswitch.scoring.signal_quality import signal_table
 from safeswitch.scoring.thresholds import FILE as THRESHOLDS
 from safeswitch.scoring.thresholds import plain_thresholds, write_thresholds
 from safeswitch.scoring_stages import calibration_of, protocols_of
+from safeswitch.sensitivity import sensitivity_table
 from safeswitch.stages import Job, complete_job, load_rows, source_of
 from safeswitch.store import Store
 from safeswitch.suite import SPLIT_SIZE, SPLITS, TASKS, Cell, Split, Task, methods, without_extra
@@ -43,7 +46,7 @@ if TYPE_CHECKING:
     from safeswitch.stages import CellTables
     from safeswitch.trained import Trained
 
-TABLES = ("leaderboard", "left_out", "signals", "comparisons")
+TABLES = ("leaderboard", "left_out", "signals", "comparisons", "failures")
 LETTERS = {"failures": "F", "rollouts": "R", "expert-queries": "Q", "privileged": "P"}
 """What a method needs, as it stands in leaderboard.md."""
 LIBRARIES = ("casadi", "dm-control", "gymnasium", "minari", "mujoco", "numpy", "pandas", "scipy", "torch")
@@ -61,7 +64,7 @@ def publish(run: Run, folder: Path | None = None) -> Path:
     run.plan, run.typical = run.stages, durations.stages(run.task.name, run.profile.name, folder)
     for reason in without_extra().values():
         log.print(f"[yellow]{escape(reason)}[/]")
-    scores, spread, figures = run.scores, run.spread, run.figures
+    scores, spread, varied, figures = run.scores, run.spread, run.varied, run.figures
     folder.mkdir(parents=True, exist_ok=True)
     for name in TABLES:
         _merge(folder / f"{name}.csv", read_csv(run.store.folder(scores.key) / f"{name}.csv"))
@@ -69,6 +72,10 @@ def publish(run: Run, folder: Path | None = None) -> Path:
     if sightings.exists():
         _merge(folder / "sightings.csv", read_csv(sightings))
     _merge(folder / "cem_seeds.csv", load_rows(run.store, spread, "cem_seeds.npz"))
+    if varied:
+        *changed, timed = varied
+        _merge(folder / "sensitivity.csv", sensitivity_table(run.store, run.task, run.task_info, changed))
+        _merge(folder / "latency.csv", load_rows(run.store, [timed], "latency.npz"))
     if run.literal is not None:
         for name in ("leaderboard", "signals"):
             table = read_csv(run.store.folder(run.literal.scores.key) / f"{name}.csv")
@@ -120,9 +127,15 @@ def _score(folder: Path, root: str, task: Task, info: TaskInfo, episodes: list[J
     write_csv(left_out_table(rows, infos), folder / "left_out.csv")
     write_csv(paired_comparisons(rows, infos), folder / "comparisons.csv")
     write_csv(signal_table(load_rows(store, signals, "signals.npz")), folder / "signals.csv")
+    write_csv(failure_table(map(partial(_tested, store), episodes)), folder / "failures.csv")
     seen = load_rows(store, signals, "sightings.npz")
     if len(seen):
         write_csv(sighting_table(seen), folder / "sightings.csv")
+
+
+def _tested(store: Store, job: Job) -> tuple[Cell, int, HandoverTable]:
+    """Cell, learner seed and test episodes of an `episodes_job`."""
+    return job.arguments[2], job.arguments[3].seed, HandoverTable.load(store.folder(job.key) / "test.npz")
 
 
 def spread_job(store: Store, task: Task, learner: int, tables: CellTables) -> Job:

@@ -289,6 +289,8 @@ class Profile:
         signal_severities: further severities of every disturbance at which the signals, and nothing else, are scored.
         signal_episodes: test episodes of those.
         literal_learners: number of learner seeds of the paper's learner taken literally.
+        sensitivity: learner seeds that drive episodes with other numbers of dropout samples; 0 leaves out all that is
+            about what results hang on.
         kept_back: test episodes in place of the test split's, drawn from a secret (`safeswitch.verification`).
     """
 
@@ -304,6 +306,7 @@ class Profile:
     signal_severities: tuple[int, ...] = ()
     signal_episodes: int = 20
     literal_learners: int = 0
+    sensitivity: int = 0
     kept_back: tuple[int, ...] = ()
 
     def seeds_of(self, task: Task, cell: Cell, split: Split) -> list[int]:
@@ -344,6 +347,7 @@ PROFILES: dict[str, Profile] = {
         tables=True,
         signal_severities=(1, 5),
         literal_learners=2,
+        sensitivity=2,
     ),
 }
 
