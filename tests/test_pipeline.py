@@ -62,7 +62,7 @@ def jobs_of(store: Store, task: Task = TASK, members: tuple[Key, ...] = ()) -> d
         keys[cell, "calibrate"], keys[task.none_cell, "calibrate"], keys[cell, "test"], keys[task.none_cell, "test"]
     )
     table = stages.table_jobs(store, task, cell, "test", 2, trained)[0]
-    episodes = scoring_stages.episodes_job(store, task, cell, trained, tables, give_back=False)
+    episodes = scoring_stages.episodes_job(store, task, cell, trained, tables, ("cem@total",), give_back=False)
     signals = scoring_stages.signals_job(store, task, cell, trained, tables.test, tables.test_nominal)
     scores = pipeline.publish.scores_job(store, task, None, [episodes], [signals])  # type: ignore[arg-type]
     spread = pipeline.publish.spread_job(store, task, 0, tables)

@@ -46,10 +46,13 @@ class Cell:
         """Whether thresholds are also calibrated on the other disturbances: severity 3 of what does harm."""
         return self.severity == 3 and self.tag in ("paper", "other")
 
-    def complete(self, split: Split) -> bool:
-        """Whether every outcome is computed in advance: tables that many rules, and cells, come back to."""
-        often = self.left_out and split == "calibrate"
-        return (self.tag == "none" and not self.track) or (self.tag == "paper" and self.severity == 3) or often
+    def complete(self, split: Split, published: bool) -> bool:
+        """Whether every outcome is computed in advance.
+
+        So it is of calibrate tables, which many rules and cells come back to, and of tables that are `published`.
+        """
+        first = (self.tag == "none" and not self.track) or (self.tag == "paper" and self.severity == 3)
+        return (first or self.left_out) if split == "calibrate" else (first and published)
 
     @property
     def env_kwargs(self) -> dict[str, Any]:
@@ -80,8 +83,9 @@ class Task:
         spared: names of cells that no profile runs, to save time; `evaluate` and `play` take them.
         others: most learners of other seeds that an ensemble asks beside its own; None for all of them.
         costly: whether an episode takes so long that a run must do without some: cells after the first three then have
-            half the episodes and no method that trains a network or asks for every outcome, signals are scored at the
-            severities of the cells alone, and rules that give control back are run in the paper's cell only.
+            half the episodes and no method that trains a network, no cell but the first three of a run that publishes
+            its tables has methods that ask for every outcome, signals are scored at the severities of the cells alone,
+            and rules that give control back are run in the paper's cell only.
     """
 
     name: str

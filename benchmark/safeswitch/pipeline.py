@@ -19,7 +19,7 @@ from joblib import Parallel, delayed, parallel_config
 from safeswitch import durations, factories, publish
 from safeswitch.console import Progress, StageError
 from safeswitch.scoring.metrics import TaskInfo
-from safeswitch.scoring_stages import episodes_job, signals_job
+from safeswitch.scoring_stages import episodes_job, methods_in, signals_job
 from safeswitch.sensitivity import SAMPLES, latency_job, samples_job, varied_job
 from safeswitch.stages import (
     CHUNK,
@@ -164,7 +164,7 @@ class Run:
                 for split in splits:
                     twins = chunks.get((trained.seed, task.undisturbed(cell), split), ())
                     seeds = self.profile.seeds_of(task, cell, split)
-                    jobs = table_jobs(self.store, task, cell, split, seeds, trained, twins)
+                    jobs = table_jobs(self.store, task, cell, split, seeds, trained, twins, self.profile.tables)
                     chunks[trained.seed, cell, split] = jobs
                     stage += jobs
             self.finish("handover tables", stage)
@@ -186,7 +186,15 @@ class Run:
         """Every method calibrated and tested in each (learner, cell)."""
         tables = self.tables
         jobs = [
-            episodes_job(self.store, self.task, cell, trained, tables[trained.seed, str(cell)], self._gives_back(cell))
+            episodes_job(
+                self.store,
+                self.task,
+                cell,
+                trained,
+                tables[trained.seed, str(cell)],
+                methods_in(self.task, cell, self.profile.tables),
+                self._gives_back(cell),
+            )
             for trained in self.trained
             for cell in self.profile.cells_of(self.task)
         ]

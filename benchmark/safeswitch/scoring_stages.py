@@ -36,21 +36,32 @@ SHOWN_CHUNKS = 1
 """Chunks of undisturbed episodes (1,600 states) on which a disturbance that is only seen is shown to the signals."""
 
 
-def episodes_job(store: Store, task: Task, cell: Cell, trained: Trained, tables: CellTables, give_back: bool) -> Job:
-    """Calibrate every method and score it on the test episodes of one (learner, cell), under both armings."""
-    ids = methods_in(task, cell)
+def episodes_job(
+    store: Store,
+    task: Task,
+    cell: Cell,
+    trained: Trained,
+    tables: CellTables,
+    ids: tuple[str, ...],
+    give_back: bool,
+) -> Job:
+    """Calibrate the methods `ids` and score them on the test episodes of one (learner, cell), under both armings."""
     settings = {"cell": str(cell), "learner_seed": trained.seed, "methods": list(ids), "give_back": give_back}
     rules = {source_of("method", name.partition("@")[0]) for name in ids}
     code = ["safeswitch.handover.panel", "safeswitch.scoring.rows", *sorted(rules)]
     optional = [module.replace("_", "-") for name, (module, _) in OPTIONAL.items() if name in ids]
     key = store.key("episodes", settings, [*trained.keys, *tables.keys], code, [*LIBRARIES, *optional])
-    arguments = (str(store.root), task, cell, trained, tables, give_back)
+    arguments = (str(store.root), task, cell, trained, tables, ids, give_back)
     return Job("episodes", f"{cell} learner {trained.seed}", key, _score_episodes, arguments)
 
 
-def methods_in(task: Task, cell: Cell) -> tuple[str, ...]:
+def methods_in(task: Task, cell: Cell, published: bool) -> tuple[str, ...]:
     """Methods that run in a cell: all but, where an episode is costly, those that `Task.costly` names."""
-    spared = {*OPTIONAL, "simplex"} if task.costly and cell not in task.cells[:3] else set()
+    spared: set[str] = set()
+    if task.costly and cell not in task.cells[:3]:
+        spared.update(OPTIONAL)
+    if task.costly and not cell.complete("test", published):
+        spared.add("simplex")
     return tuple(name for name in methods(task.rule_signals) if name not in spared)
 
 
@@ -61,6 +72,7 @@ def _score_episodes(
     cell: Cell,
     trained: Trained,
     tables: CellTables,
+    ids: tuple[str, ...],
     give_back: bool,
 ) -> None:
     loaded = tables.load(Store(Path(root)), task, cell)
@@ -70,7 +82,7 @@ def _score_episodes(
     for protocol in protocols_of(cell):
         test = test_panel(loaded, cell, protocol)
         calibration = calibration_of(loaded, task, cell, protocol, trained.seed)
-        for method_id in methods_in(task, cell):
+        for method_id in ids:
             method: Method = registry.make_method(method_id)
             if not method.latched and not (give_back and protocol == "start"):
                 continue
@@ -87,18 +99,18 @@ def _score_episodes(
             nominal = loaded["calibrate_nominal"]
             twins = nominal.take(np.searchsorted(nominal.seeds, others.seeds))  # seeds of a split are increasing
             left_out = Calibration(panel_of(others, twins, protocol), nominal, seed=trained.seed)
-            frames += _left_out_rows(task, cell, trained, test, left_out)
+            frames += _left_out_rows(ids, cell, trained, test, left_out)
     save_frame(folder / "episodes.npz", concat(frames))
     save_arrays(folder / "logs.npz", **logs)
     loaded["test"].save(folder / "test.npz", snapshots=False)
 
 
 def _left_out_rows(
-    task: Task, cell: Cell, trained: Trained, test: Panel, calibration: Calibration
+    ids: tuple[str, ...], cell: Cell, trained: Trained, test: Panel, calibration: Calibration
 ) -> list[pd.DataFrame]:
     """Rows of the latched methods that learn from disturbed episodes, calibrated on those of other disturbances."""
     frames = []
-    for method in map(registry.make_method, methods_in(task, cell)):
+    for method in map(registry.make_method, ids):
         learns = method.needs & {"failures", "rollouts"} and "privileged" not in method.needs
         calibrated = method.calibrate(calibration) if learns and method.latched else None
         if calibrated is not None and calibrated.rule is not None:

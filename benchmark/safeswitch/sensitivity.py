@@ -162,18 +162,18 @@ def sensitivity_table(store: Store, task: Task, info: TaskInfo, jobs: list[Job])
 
 def latency_job(store: Store, task: Task, trained: Trained, tables: CellTables) -> Job:
     """Time from an observation to the driver of the next step, for every method, with one learner."""
-    ids = methods_in(task, task.paper_cell)
+    ids = methods_in(task, task.paper_cell, published=True)
     key = store.key("latency", {"methods": list(ids)}, [*trained.keys, *tables.keys], ["safeswitch.sensitivity"])
-    return Job("latency", task.name, key, _time, (str(store.root), task, trained, tables))
+    return Job("latency", task.name, key, _time, (str(store.root), task, trained, tables, ids))
 
 
-def _time(folder: Path, root: str, task: Task, trained: Trained, tables: CellTables) -> None:
+def _time(folder: Path, root: str, task: Task, trained: Trained, tables: CellTables, ids: tuple[str, ...]) -> None:
     cell, rows = task.paper_cell, []
     loaded = tables.load(Store(Path(root)), task, cell)
     calibration = calibration_of(loaded, task, cell, "start", trained.seed)
     env = make_env(task, task.none_cell)
     frames = [_frames(env, int(seed)) for seed in loaded["test_nominal"].seeds[:TIMED]]
-    for name in methods_in(task, cell):
+    for name in ids:
         method = registry.make_method(name)
         rule = method.calibrate(calibration).rule
         if rule is None or "expert-queries" in method.needs or not hasattr(rule, "update"):

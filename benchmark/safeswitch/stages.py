@@ -150,17 +150,18 @@ def table_jobs(
     seeds: Sequence[int] | int,
     trained: Trained,
     twins: Sequence[Job] = (),
+    published: bool = False,
 ) -> list[Job]:
     """The handover table of one (cell, learner) on episode seeds of a split (or its first ones), in chunks of episodes.
 
-    Outcomes are computed here for the cells whose tables are used again and again (`Cell.complete`); elsewhere they
-    are computed when a rule first asks for them. Where the disturbance is only seen, those up to the onset are taken
-    from `twins`, finished jobs of the undisturbed cell.
+    Outcomes are computed here for the tables that are used again and again, or `published` (`Cell.complete`);
+    elsewhere they are computed when a rule first asks for them. Where the disturbance is only seen, those up to the
+    onset are taken from `twins`, finished jobs of the undisturbed cell.
     """
     twins = twins if only_seen(cell) else ()
     seeds = episode_seeds(split, seeds) if isinstance(seeds, int) else seeds
     code = [*PHYSICS, *task.code(), *HANDOVER, source_of("learner", task.learner), *signal_code(task)]
-    jobs = []
+    complete, jobs = cell.complete(split, published), []
     for index, first in enumerate(range(0, len(seeds), CHUNK)):
         chunk = list(seeds[first : first + CHUNK])
         twin = [twins[index].key] if twins else []
@@ -170,11 +171,11 @@ def table_jobs(
             "split": split,
             "seeds": chunk,
             "signals": list(task.signals),
-            "complete": cell.complete(split),
+            "complete": complete,
         }
         key = store.key("table", settings, [*trained.keys, *twin], code)
         label = f"{cell} {split} {first}-{first + len(chunk) - 1} (learner {trained.seed})"
-        arguments = (task, cell, split, chunk, trained, [str(store.folder(key)) for key in twin])
+        arguments = (task, cell, chunk, trained, [str(store.folder(key)) for key in twin], complete)
         jobs.append(Job("table", label, key, _tabulate, arguments))
     return jobs
 
@@ -183,16 +184,16 @@ def _tabulate(
     folder: Path,
     task: Task,
     cell: Cell,
-    split: Split,
     seeds: Sequence[int],
     trained: Trained,
     twins: Sequence[str],
+    complete: bool,
 ) -> None:
     env = make_env(task, cell)
     table = record_table(env, trained.learner(task), trained.signals(task), env.make_expert(), seeds)
     for twin in twins:
         table.share(HandoverTable.load(Path(twin) / "table.npz"))
-    if cell.complete(split):
+    if complete:
         table.complete()
     table.save(folder / "table.npz")
     env.close()

@@ -154,16 +154,17 @@ class Panel:
         """Thresholds between which a constant threshold is worth having: the run of thresholds around the best one
         whose mean return is above that of learner, expert and timer. NaN, NaN where there is none.
         """
-        thresholds = self.candidate_thresholds(name)
-        returns = self.returns(self.handover_at(name, thresholds), phi).mean(axis=1)
-        worth = returns > self.trivial_return(phi)
-        best = int(np.argmax(returns))
-        if not worth[best]:
+        thresholds, trivial = self.candidate_thresholds(name), self.trivial_return(phi)
+        handover = self.handover_at(name, thresholds)
+        low, value = self.best_of(handover, phi)
+        if value <= trivial:
             return float("nan"), float("nan")
-        below, above = np.flatnonzero(~worth[:best]), np.flatnonzero(~worth[best:])
-        low = thresholds[below[-1] + 1] if below.size else thresholds[0]
-        high = thresholds[best + above[0]] if above.size else np.inf
-        return float(low), float(high)
+        high = low + 1  # outwards, so that no outcome is asked for beyond the first threshold that is not worth it
+        while low > 0 and float(self.returns(handover[low - 1], phi).mean()) > trivial:
+            low -= 1
+        while high < len(handover) and float(self.returns(handover[high], phi).mean()) > trivial:
+            high += 1
+        return float(thresholds[low]), float(thresholds[high]) if high < len(handover) else np.inf
 
     def trivial_return(self, phi: float = PHI) -> float:
         """R0: the best mean return without any signal, of the learner, the expert, or the best delay (timer)."""
