@@ -83,9 +83,8 @@ class Task:
         spared: names of cells that no profile runs, to save time; `evaluate` and `play` take them.
         others: most learners of other seeds that an ensemble asks beside its own; None for all of them.
         costly: whether an episode takes so long that a run must do without some: cells after the first three then have
-            half the episodes and no method that trains a network, no cell but the first three of a run that publishes
-            its tables has methods that ask for every outcome, signals are scored at the severities of the cells alone,
-            and rules that give control back are run in the paper's cell only.
+            half the episodes, methods that ask for every outcome run only where the tables have them, signals are
+            scored at the severities of the cells alone, and rules that give control back run in the paper's cell only.
     """
 
     name: str

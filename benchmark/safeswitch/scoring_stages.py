@@ -56,10 +56,10 @@ def episodes_job(
 
 
 def methods_in(task: Task, cell: Cell, published: bool) -> tuple[str, ...]:
-    """Methods that run in a cell: all but, where an episode is costly, those that `Task.costly` names."""
-    spared: set[str] = set()
-    if task.costly and cell not in task.cells[:3]:
-        spared.update(OPTIONAL)
+    """Methods that run in a cell. Those that train a network run in the first three cells; for `simplex` see
+    `Task.costly`.
+    """
+    spared = set() if cell in task.cells[:3] else set(OPTIONAL)
     if task.costly and not cell.complete("test", published):
         spared.add("simplex")
     return tuple(name for name in methods(task.rule_signals) if name not in spared)
