@@ -45,7 +45,11 @@ KEYS = {
     "signals": ("signal",),
     "paper_literal_signals": ("signal",),
     "comparisons": ("protocol", "reference", "method"),
+    "left_out": ("protocol", "method"),
+    "sensitivity": ("protocol", "parameter", "value", "method"),
+    "sightings": ("kind", "signal"),
 }
+"""What names a row of a table within a cell; a cell of left_out.csv is a whole task."""
 
 
 @cache
@@ -54,6 +58,8 @@ def table(name: str) -> pd.DataFrame:
     if name not in KEYS:
         raise ValueError(f"no table {name!r} to quote; there are {', '.join(KEYS)}")
     frame = read_csv(RESULTS / f"{name}.csv")
+    if name == "left_out":
+        return frame.assign(cell=frame["task"])
     severity = frame["severity"].map(lambda value: f"-{value}" if value else "")
     return frame.assign(cell=frame["task"] + "/" + frame["disturbance"] + severity)
 
@@ -63,7 +69,7 @@ def row(name: str, cell: str, *values: str) -> pd.Series:
     frame = table(name)
     chosen = frame[frame["cell"] == cell]
     for key, value in zip(KEYS[name], values, strict=True):
-        chosen = chosen[chosen[key] == value]
+        chosen = chosen[chosen[key] == (float(value) if key == "value" else value)]
     if len(chosen) != 1:
         raise ValueError(f"{len(chosen)} rows of {name}.csv are {cell} {' '.join(values)}, expected one")
     return chosen.iloc[0]
@@ -89,20 +95,48 @@ def current(text: str) -> str:
         return shown.replace("-0.00", "0.00") + match["quote"]
 
     def rows(match: re.Match[str]) -> str:
-        lines = ["| method | return | success | autonomy | skill |", "| :-- | --: | --: | --: | --: |"]
-        for method in match["methods"].split():
-            found = row(match["table"], match["cell"], match["protocol"], method)
-            interval = "{return_mean:.2f} [{return_lo:.2f}, {return_hi:.2f}]".format(**found)
-            skill = "–" if pd.isna(found["contest_gap"]) else "no contest"
-            if pd.notna(found["skill"]):
-                skill = "{skill:.2f} [{skill_lo:.2f}, {skill_hi:.2f}]".format(**found)
-            lines.append(f"| `{method}` | {interval} | {found['success']:.2f} | {found['autonomy']:.2f} | {skill} |")
+        found = {
+            method: row(match["table"], match["cell"], match["protocol"], method) for method in match["methods"].split()
+        }
+        lines = left_out_lines(found) if match["table"] == "left_out" else leaderboard_lines(found)
         return match["open"] + "\n" + "\n".join(lines) + "\n\n" + match["close"]
 
     def disturbances(match: re.Match[str]) -> str:
         return match["open"] + "\n" + "\n".join(disturbance_table(match["task"])) + "\n\n" + match["close"]
 
     return DISTURBANCES.sub(disturbances, ROWS.sub(rows, NUMBER.sub(number, text)))
+
+
+def leaderboard_lines(found: dict[str, pd.Series]) -> list[str]:
+    """Markdown table of rows of a leaderboard."""
+    lines = ["| method | return | success | autonomy | skill |", "| :-- | --: | --: | --: | --: |"]
+    for method, each in found.items():
+        skill = "–" if pd.isna(each["contest_gap"]) else "no contest"
+        if pd.notna(each["skill"]):
+            skill = with_interval(each, "skill", "skill")
+        shown = with_interval(each, "return_mean", "return")
+        lines.append(f"| `{method}` | {shown} | {each['success']:.2f} | {each['autonomy']:.2f} | {skill} |")
+    return lines
+
+
+def left_out_lines(found: dict[str, pd.Series]) -> list[str]:
+    """Markdown table of rows of left_out.csv."""
+    lines = [
+        "| method | return | success | autonomy | minus `cem@total` | minus `grid@total` | gap closed |",
+        "| :-- | --: | --: | --: | --: | --: | --: |",
+    ]
+    for method, each in found.items():
+        differences = (with_interval(each, f"minus_{rival}", f"minus_{rival}", "+") for rival in ("cem", "grid"))
+        shares = (f"{each[name]:.2f}" for name in ("success", "armed_autonomy"))
+        shown = [with_interval(each, "return_mean", "return"), *shares, *differences, f"{each['gap_closed']:.2f}"]
+        lines.append(" | ".join([f"| `{method}`", *shown]) + " |")
+    return lines
+
+
+def with_interval(found: pd.Series, name: str, bounds: str, sign: str = "") -> str:
+    """A score with its interval."""
+    value, low, high = (f"{found[each]:{sign}.2f}" for each in (name, f"{bounds}_lo", f"{bounds}_hi"))
+    return f"{value} [{low}, {high}]"
 
 
 def disturbance_table(task: str) -> list[str]:

@@ -35,18 +35,18 @@ def test_every_change_has_a_row_with_its_interval_under_both_armings(table: pd.D
         for parameter, changes in CEM_CHANGES.items():
             values = rows.loc[rows["parameter"] == parameter, "value"].tolist()
             assert values == sorted(float(next(iter(each.values()))) for each in changes)
-        learning = rows[rows["parameter"] == "calibrate episodes"]
+        learning = rows[rows["parameter"] == "calibrate-episodes"]
         assert sorted(zip(learning["value"], learning["method"], strict=True)) == sorted(
             (float(count), method) for count in COUNTS for method in LEARNING
         )
         assert rows.loc[rows["parameter"] == "phi", "value"].tolist() == list(PHIS)
-        assert rows.loc[rows["parameter"] == "samples K", "value"].tolist() == [float(k) for k in SAMPLES]
+        assert rows.loc[rows["parameter"] == "dropout-samples", "value"].tolist() == [float(k) for k in SAMPLES]
     assert (table["return_lo"] <= table["return_mean"] + 1e-9).all()
     assert (table["return_mean"] <= table["return_hi"] + 1e-9).all()
 
 
 def test_more_draws_cost_more_episodes(table: pd.DataFrame) -> None:
-    for parameter in ("candidates", "shared episodes"):
+    for parameter in ("candidates", "shared-episodes"):
         rows = table[(table["parameter"] == parameter) & (table["protocol"] == "onset")].sort_values("value")
         assert (np.diff(rows["tuning_episodes"]) > 0).all()
 

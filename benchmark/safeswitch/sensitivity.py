@@ -37,7 +37,7 @@ REFERENCE_METHODS = (*REFERENCES, f"best@{SIGNAL}")
 CEM_CHANGES: Mapping[str, tuple[dict[str, int], ...]] = {
     "candidates": tuple({"candidates": n, "elites": n // 2} for n in (4, 8, 16, 32, 64)),
     "iterations": tuple({"iterations": n, "average": min(n, 15)} for n in (5, 10, 20, 40, 80)),
-    "shared episodes": tuple({"episodes": n} for n in (2, 4, 8, 16, 32)),
+    "shared-episodes": tuple({"episodes": n} for n in (2, 4, 8, 16, 32)),
 }
 """Changes of `cem@total`, by the field that is varied; its name in the table and the value are those of the first."""
 LEARNING = ("cem@total", "grid@total", "random-search@total", "cem-vector", "fixed-q95@total", "conformal@total")
@@ -92,7 +92,7 @@ def _variants(calibration: Calibration) -> Iterator[tuple[str, float, Any, Calib
             yield parameter, float(next(iter(each.values()))), cem(SIGNAL, **each), None
     for count in COUNTS:
         for name in LEARNING:
-            yield "calibrate episodes", float(count), registry.make_method(name), first_episodes(calibration, count)
+            yield "calibrate-episodes", float(count), registry.make_method(name), first_episodes(calibration, count)
     for phi in PHIS:
         yield "phi", phi, cem(SIGNAL), replace(calibration, phi=phi)
 
@@ -145,7 +145,7 @@ def _drive(folder: Path, task: Task, trained: Trained, seeds: Mapping[str, list[
         calibration = calibration_of(loaded, task, cell, protocol, trained.seed)
         for name in (*REFERENCE_METHODS, f"cem@{SIGNAL}"):
             frames.append(_rows(test, calibration, cell, trained, registry.make_method(name)))
-    save_frame(folder / "varied.npz", concat(frames).assign(parameter="samples K", value=float(samples)))
+    save_frame(folder / "varied.npz", concat(frames).assign(parameter="dropout-samples", value=float(samples)))
 
 
 def sensitivity_table(store: Store, task: Task, info: TaskInfo, jobs: list[Job]) -> pd.DataFrame:
