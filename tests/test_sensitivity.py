@@ -12,7 +12,10 @@ import pytest
 from micro import MICRO, TASK
 from safeswitch.files import load_frame
 from safeswitch.pipeline import Run
+from safeswitch.scoring.leaderboard import leaderboard
+from safeswitch.scoring_stages import GIVE_BACK_SEEDS
 from safeswitch.sensitivity import CEM_CHANGES, COUNTS, LEARNING, PHIS, SAMPLES, first_episodes, sensitivity_table
+from safeswitch.stages import concat
 from safeswitch.store import Store
 from safeswitch_baselines.rules.cem import CEM
 from synthetic import random_calibration
@@ -71,3 +74,15 @@ def test_cem_takes_changed_settings_by_name() -> None:
     assert CEM("total", iterations=3).calibrate(calibration).log["accepted"].sum() == 3
     with pytest.raises(TypeError, match="iteration"):
         CEM("total", iteration=3).calibrate(calibration)
+
+
+def test_a_costly_task_drives_rules_that_give_back_on_a_few_episodes(tmp_path: Path) -> None:
+    task = replace(TASK, costly=True)
+    run = Run(task, replace(MICRO, give_back_cells=2, test=GIVE_BACK_SEEDS + 1), Store(tmp_path), 1)
+    rows = concat([load_frame(run.store.folder(job.key) / "episodes.npz") for job in run.episodes])
+    count = rows[rows["protocol"] == "start"].groupby(["disturbance", "method"]).size()
+    assert count["cart-mass", "cem-two@total"] == 2 * GIVE_BACK_SEEDS
+    assert count["cart-mass", "cem@total"] == 2 * (GIVE_BACK_SEEDS + 1)
+    assert "cem-two@total" not in count["none"]
+    scored = leaderboard(rows, {task.name: run.task_info}).set_index(["disturbance", "protocol", "method"])
+    assert scored.loc[("cart-mass", "start", "cem-two@total"), "episodes"] == 2 * GIVE_BACK_SEEDS

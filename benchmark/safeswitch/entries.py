@@ -84,7 +84,8 @@ class Task:
         others: most learners of other seeds that an ensemble asks beside its own; None for all of them.
         costly: whether an episode takes so long that a run must do without some: cells after the first three then have
             half the episodes, methods that ask for every outcome run only where the tables have them, signals are
-            scored at the severities of the cells alone, and rules that give control back run in the paper's cell only.
+            scored at the severities of the cells alone, rules that give control back run on a few episodes of the
+            paper's cell, and one learner drives with other numbers of dropout samples.
     """
 
     name: str

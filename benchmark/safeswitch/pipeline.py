@@ -273,7 +273,7 @@ class Run:
         jobs = [varied_job(self.store, self.task, each, tables[each.seed]) for each in self.trained]
         jobs += [
             samples_job(self.store, self.task, self.profile, each, samples)
-            for each in self.trained[: self.profile.sensitivity]
+            for each in self.trained[: 1 if self.task.costly else self.profile.sensitivity]
             for samples in SAMPLES
         ]
         jobs.append(latency_job(self.store, self.task, self.trained[0], tables[0]))

@@ -32,6 +32,8 @@ from safeswitch.trained import Trained
 if TYPE_CHECKING:
     from safeswitch.protocols import Method
 
+GIVE_BACK_SEEDS = 10
+"""Test seeds per learner on which rules that give control back are driven where an episode is costly."""
 SHOWN_CHUNKS = 1
 """Chunks of undisturbed episodes (1,600 states) on which a disturbance that is only seen is shown to the signals."""
 
@@ -47,6 +49,8 @@ def episodes_job(
 ) -> Job:
     """Calibrate the methods `ids` and score them on the test episodes of one (learner, cell), under both armings."""
     settings = {"cell": str(cell), "learner_seed": trained.seed, "methods": list(ids), "give_back": give_back}
+    if give_back and task.costly:
+        settings["give_back_seeds"] = GIVE_BACK_SEEDS
     rules = {source_of("method", name.partition("@")[0]) for name in ids}
     code = ["safeswitch.handover.panel", "safeswitch.scoring.rows", *sorted(rules)]
     optional = [module.replace("_", "-") for name, (module, _) in OPTIONAL.items() if name in ids]
@@ -92,7 +96,8 @@ def _score_episodes(
             if method.latched:
                 rows = latched_rows(test, calibrated)
             else:
-                rows = plain_rows(task, cell, trained, test, method, calibrated.rule)
+                some = test.take(np.isin(test.table.seeds, test.table.seeds[:GIVE_BACK_SEEDS])) if task.costly else test
+                rows = plain_rows(task, cell, trained, some, method, calibrated.rule)
             frames.append(labelled(rows, cell, protocol, method_id, trained.seed, calibrated, own))
             logs.update({f"{protocol}|{method_id}|{name}": value for name, value in calibrated.log.items()})
         if others is not None:
