@@ -1,7 +1,8 @@
 """Which methods are a constant threshold on one signal, and at which value for each learner.
 
-A method counts as one if, on every test episode, it hands over exactly where `signal > threshold` does. That is
-checked and not declared, so a rule with patience, with another episode's trace or with memory is never taken for one.
+A method counts as one if, on every test episode, it hands over exactly where `signal > threshold` does, and never gives
+control back. That is checked and not declared, so a rule with patience, with another episode's trace or with memory is
+never taken for one; nor is one that ran on some of the episodes only.
 """
 
 from __future__ import annotations
@@ -47,9 +48,13 @@ def _is_plain(panel: Panel, group: pd.DataFrame) -> bool:
     signal, threshold = signal_of(str(group["method"].iloc[0])), float(group["threshold"].iloc[0])
     if signal is None or signal not in panel.table.signals or np.isnan(threshold):
         return False
+    if len(group) < len(panel):
+        return False
     if not np.array_equal(group["seed"].to_numpy(), panel.table.seeds):
         raise ValueError("the rows of a method are not the episodes of the panel, in its order")
-    return np.array_equal(panel.handover_at(signal, np.array([threshold]))[0], group["handover"].to_numpy())
+    handover = panel.handover_at(signal, np.array([threshold]))[0]
+    driven = {"handover": handover, "learner_steps": panel.learner_steps(handover)}
+    return all(np.array_equal(steps, group[name].to_numpy()) for name, steps in driven.items())
 
 
 def write_thresholds(frame: pd.DataFrame, path: Path) -> Path:
