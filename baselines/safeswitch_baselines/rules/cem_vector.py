@@ -43,16 +43,20 @@ NARROWEST = 0.25
 
 @dataclass(frozen=True)
 class Settings:
-    """Free parameters of the search, chosen on calibrate episodes of the cart-pole, one half against the other.
+    """Free parameters of the search, chosen on calibrate episodes of the cart-pole: one half of a disturbance's against
+    the other, and those of all other disturbances against its own.
 
     Attributes:
         candidates: drawn per iteration.
-        elites: how many of the best refit the distribution.
+        elites: how many of the best refit the distribution: half of them, as in `cem@`, so that the search settles in
+            the middle of what works. With a quarter it settles near the edge of what it has seen, where a disturbance
+            that it has not seen fails.
         iterations: of the search.
         episodes: shared by the candidates of an iteration; 2 x under `start`, half of them
             undisturbed. Few candidates on many episodes generalise better than the reverse.
         smoothing: weight of the refit against the value of before.
-        floor: smallest standard deviation of every parameter.
+        floor: smallest standard deviation of every parameter but theta.
+        theta_floor: that of theta.
         average: the result is the mean of this many last iterations.
         theta: initial mean of the threshold, in standard deviations.
         memory: initial mean of logit a.
@@ -60,12 +64,13 @@ class Settings:
     """
 
     candidates: int = 16
-    elites: int = 4
+    elites: int = 8
     iterations: int = 10
     episodes: int = 64
     smoothing: float = 0.5
     floor: float = 0.3
-    average: int = 3
+    theta_floor: float = 0.75
+    average: int = 5
     theta: float = 2.0
     memory: float = -1.0
     blend: float = 1.0
@@ -228,6 +233,7 @@ def learn(calibration: Calibration, settings: Settings, name: str) -> tuple[Scor
     sampler = EpisodeSampler(panel, settings.episodes * (1 if panel.arming == "onset" else 2), rng)
     mu = np.array([0.0] * len(baseline.names) + [settings.blend, settings.memory, 0.0, settings.theta])
     sigma = np.array([1.0] * len(baseline.names) + [2.0, 1.0, 1.0, 1.5])
+    floor = np.array([settings.floor] * (len(mu) - 1) + [settings.theta_floor])
     samples, returned, means, queries = [], [], [], 0
     for _ in range(settings.iterations):
         points = rng.normal(mu, sigma, (settings.candidates, len(mu)))
@@ -237,7 +243,7 @@ def learn(calibration: Calibration, settings: Settings, name: str) -> tuple[Scor
         queries += expert_steps(shared, handover)
         elite = points[np.argsort(-returns, kind="stable")[: settings.elites]]
         mu = mu + settings.smoothing * (elite.mean(axis=0) - mu)
-        sigma = np.maximum(sigma + settings.smoothing * (elite.std(axis=0) - sigma), settings.floor)
+        sigma = np.maximum(sigma + settings.smoothing * (elite.std(axis=0) - sigma), floor)
         samples.append(points)
         returned.append(returns)
         means.append(mu)
