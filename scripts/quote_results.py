@@ -9,6 +9,11 @@ A quoted number is followed by an HTML comment, which no reader sees, that says 
 the name of a CSV file in results/, the cell, the row, the column. The number keeps as many digits as it has. Between
 `<!--rows leaderboard CELL PROTOCOL: METHOD METHOD ... -->` and `<!--/rows-->` stands a table of those methods.
 
+Between `<!--signals CELL PROTOCOL COLUMN[/COLUMN]: RULE RULE ... -->` and `<!--/signals-->` stands a table of these
+columns of leaderboard.csv for `RULE@signal`, a row per signal.
+
+Rows whose threshold comes from other disturbances are quoted from left_out.csv alone.
+
 Between `<!--disturbances TASK-->` and `<!--/disturbances-->` stands the table of a task's disturbances.
 
 Usage: python scripts/quote_results.py [--write] [FILE ...]     (default: every page of docs/, and README.md)
@@ -27,6 +32,7 @@ from pathlib import Path
 import pandas as pd
 
 from safeswitch.scoring.leaderboard import read_csv
+from safeswitch.scoring.metrics import OTHERS
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "results"
@@ -34,6 +40,11 @@ NUMBER = re.compile(r"(?P<number>[-+]?\d+(?:\.(?P<digits>\d+))?|–)(?P<quote><!
 ROWS = re.compile(
     r"(?P<open><!--rows (?P<table>\S+) (?P<cell>\S+) (?P<protocol>\S+): (?P<methods>[^>]*?) -->\n)"
     r".*?(?P<close><!--/rows-->)",
+    re.DOTALL,
+)
+SIGNALS = re.compile(
+    r"(?P<open><!--signals (?P<cell>\S+) (?P<protocol>\S+) (?P<columns>\S+): (?P<rules>[^>]*?) -->\n)"
+    r".*?(?P<close><!--/signals-->)",
     re.DOTALL,
 )
 DISTURBANCES = re.compile(
@@ -60,6 +71,8 @@ def table(name: str) -> pd.DataFrame:
     frame = read_csv(RESULTS / f"{name}.csv")
     if name == "left_out":
         return frame.assign(cell=frame["task"])
+    if "calibrated_on" in frame:
+        frame = frame[frame["calibrated_on"] != OTHERS]
     severity = frame["severity"].map(lambda value: f"-{value}" if value else "")
     return frame.assign(cell=frame["task"] + "/" + frame["disturbance"] + severity)
 
@@ -104,7 +117,32 @@ def current(text: str) -> str:
     def disturbances(match: re.Match[str]) -> str:
         return match["open"] + "\n" + "\n".join(disturbance_table(match["task"])) + "\n\n" + match["close"]
 
-    return DISTURBANCES.sub(disturbances, ROWS.sub(rows, NUMBER.sub(number, text)))
+    def signals(match: re.Match[str]) -> str:
+        lines = signal_lines(match["cell"], match["protocol"], match["columns"].split("/"), match["rules"].split())
+        return match["open"] + "\n" + "\n".join(lines) + "\n\n" + match["close"]
+
+    return DISTURBANCES.sub(disturbances, SIGNALS.sub(signals, ROWS.sub(rows, NUMBER.sub(number, text))))
+
+
+def signal_lines(cell: str, protocol: str, columns: list[str], rules: list[str]) -> list[str]:
+    """Markdown table of columns of the leaderboard, signals by rules; blank where a method has no row."""
+    frame = table("leaderboard")
+    frame = frame[(frame["cell"] == cell) & (frame["protocol"] == protocol)]
+    frame = frame.set_index("method")
+    signals = dict.fromkeys(
+        method.partition("@")[2] for method in frame.index if method.partition("@")[0] in rules and "@" in method
+    )
+    if not signals:
+        raise ValueError(f"no method {' or '.join(rule + '@' for rule in rules)} in {cell} {protocol}")
+    lines = ["| signal | " + " | ".join(f"`{rule}@`" for rule in rules) + " |", "| :-- |" + " --: |" * len(rules)]
+    for signal in signals:
+        shown = []
+        for rule in rules:
+            found = frame.loc[f"{rule}@{signal}"] if f"{rule}@{signal}" in frame.index else None
+            values = ["" if found is None or pd.isna(found[name]) else f"{found[name]:.2f}" for name in columns]
+            shown.append(" / ".join(values) if any(values) else "")
+        lines.append(f"| `{signal}` | " + " | ".join(shown) + " |")
+    return lines
 
 
 def leaderboard_lines(found: dict[str, pd.Series]) -> list[str]:

@@ -142,6 +142,14 @@ def test_a_number_that_is_off_is_found_and_put_right(quotes: ModuleType) -> None
     assert "| `learner` |" in right and "old" not in right and quotes.current(right) == right
 
 
+def test_a_table_of_signals_has_a_row_for_each_that_the_rules_run_on(quotes: ModuleType) -> None:
+    block = "<!--signals cart-pole/repaint-3 start harm/false_alarms: cem -->\n{}<!--/signals-->"
+    text = quotes.current(block.format(""))
+    assert re.search(r"\| `total` \| \d\.\d\d / \d\.\d\d \|", text) and text == quotes.current(text)
+    with pytest.raises(ValueError, match="no method nothing@"):
+        quotes.current(block.format("").replace("cem", "nothing"))
+
+
 @pytest.mark.parametrize(
     ("where", "message"),
     [
