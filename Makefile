@@ -33,8 +33,9 @@ demos: setup ## record the expert's demonstrations only (PROFILE=, TASK=, JOBS=)
 test: setup ## run the tests, without the slow ones
 	$(BIN)/python -m pytest -m "not slow" -n $(TEST_JOBS)
 
+# With every extra that some slow test would be skipped without.
 test-slow: ## run the slow tests: packaging, long properties, full protocols, the report in a browser, documentation
-	@bash scripts/setup.sh dev,browser,docs
+	@bash scripts/setup.sh dev,browser,docs,perf,rl,tensorboard
 	$(BIN)/python -m pytest -m slow -n $(TEST_JOBS)
 
 perf: ## time the expert, pictures, decisions from images and the handover table, each beside a rival

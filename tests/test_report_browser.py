@@ -15,6 +15,7 @@ import pytest
 
 import report_reader as reader
 from micro import micro_run
+from report_scripts import MARKS, NAMELESS, SPOILT_LABELS
 from results_folder import write_results
 from safeswitch.files import load_json
 from safeswitch.publish import publish
@@ -40,25 +41,6 @@ FLAGS = (
     "--disable-background-networking", "--disable-component-update", "--hide-scrollbars",
     "--host-resolver-rules=MAP * ~NOTFOUND",
 )  # fmt: skip
-
-MARKS = """
-const found = [];
-for (const mark of state.marks) {
-  setMark(mark);
-  const boxes = [...$("numbers").children];
-  const numbers = Object.fromEntries(boxes.map((box) => [box.dataset.score, Number(box.dataset.value)]));
-  found.push({ method: mark.method, on: mark.on, numbers, check: $("check").textContent,
-    shown: $("numbers").querySelector("[data-score=success] dd").textContent });
-}
-return [state.cell.name, state.protocol, found];
-"""
-
-NAMELESS = """
-const named = (each) => each.labels?.length || each.textContent.trim() || each.getAttribute("aria-label")
-  || each.getAttribute("aria-labelledby");
-const controls = [...document.querySelectorAll("button, input, select")];
-return controls.filter((each) => !named(each)).map((each) => each.outerHTML);
-"""
 
 
 @pytest.fixture(scope="module", params=["made", "committed"])
@@ -225,11 +207,27 @@ def test_no_width_scrolls_sideways(browse: Callable[..., Any], width: int) -> No
     assert max(driver.execute_script(edges)) <= width
 
 
+@pytest.mark.parametrize("width", [320, 1280])
+def test_labels_of_charts_are_whole_and_apart(page: Path, browse: Callable[..., Any], width: int) -> None:
+    driver, seen = browse(width=width), 0
+    for task in reader.tasks_of(page):
+        choose(driver, task=task)
+        for signal in driver.execute_script("return [...$('signal').options].map((each) => each.value)"):
+            choose(driver, signal=signal)
+            for episode in range(0, driver.execute_script("return $('episode').options.length"), 97):
+                driver.execute_script("openEpisode($('episode').options[arguments[0]].value, false)", episode)
+                assert driver.execute_script(SPOILT_LABELS) == [], (task, signal, episode)
+                seen += driver.execute_script("return document.querySelectorAll('.chart text').length")
+    assert seen > 100
+
+
 def test_dark_follows_the_system_and_the_button(browse: Callable[..., Any]) -> None:
     driver = browse(dark=True)
     background = "return getComputedStyle(document.body).backgroundColor"
-    dark = driver.execute_script(background)
+    dark, pressed = driver.execute_script(background), driver.find_element("id", "theme").get_attribute("aria-pressed")
+    assert pressed == "true"
     driver.find_element("id", "theme").click()
+    assert driver.find_element("id", "theme").get_attribute("aria-pressed") == "false"
     assert driver.execute_script(background) != dark
     driver.refresh()
     ready(driver)
@@ -307,9 +305,10 @@ def axe(tmp_path_factory: pytest.TempPathFactory) -> str:
         return script.read().decode()
 
 
-@pytest.mark.parametrize("dark", [False, True])
-def test_axe_finds_nothing_to_object_to(browse: Callable[..., Any], axe: str, dark: bool) -> None:
-    driver = browse(dark=dark)
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+@pytest.mark.parametrize("width", [320, 1280])
+def test_axe_finds_nothing_to_object_to(browse: Callable[..., Any], axe: str, width: int, dark: bool) -> None:
+    driver = browse(width=width, dark=dark)
     driver.execute_script(axe)
     report = driver.execute_async_script("axe.run(document, {resultTypes: ['violations']}).then(arguments[0])")
     assert report["passes"] or report["incomplete"] is not None

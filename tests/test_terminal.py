@@ -73,6 +73,8 @@ class Terminal:
         self.text = ""
         pid, self.descriptor = pty.fork()
         if pid == 0:
+            # Shells start background commands with Ctrl-C ignored, and children inherit that; a terminal's do hear it.
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
             os.execve(command[0], command, environment(**changes))
         self.pid = pid
         fcntl.ioctl(self.descriptor, termios.TIOCSWINSZ, struct.pack("HHHH", 40, 100, 0, 0))

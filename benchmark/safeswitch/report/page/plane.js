@@ -10,7 +10,7 @@ function drawPlane(state) {
   const rows = state.board.rows;
   const [x, y] = planeScales(rows, state, width, height);
   const root = svg("svg", { viewBox: `0 0 ${width} ${height}`, width, height, role: "group", "aria-labelledby": "plane-caption" });
-  axes(root, x, y, { xName: "autonomy: share of steps that the learner drives", yName: "success", xTicks: width < 560 ? 4 : 8 });
+  axes(root, x, y, { xName: ["autonomy: share of steps that the learner drives", "autonomy"], yName: "success", xTicks: width < 560 ? 4 : 8 });
   let ring = null;
   if (state.sweep) {
     root.append(line(x, y, state.sweep.autonomy, state.sweep.success, { class: "reach" }));
@@ -103,12 +103,12 @@ function planeLabels(points, state, x, y, width) {
     : row.method === `best@${state.signal}` ? 3 : row.method.endsWith(`@${state.signal}`) ? 4 : 9;
   for (const row of [...points].sort((a, b) => rank(a) - rank(b))) {
     if (rank(row) > 4) break;
-    const [px, py, size] = [x(row.autonomy), y(row.success), 6.3 * row.method.length];
+    const [px, py, size] = [x(row.autonomy), y(row.success), widthOf(row.method, row.method === state.method ? "bold 11.5px" : "11.5px")];
     for (const [dx, dy, anchor] of [[9, 4, "start"], [-9, 4, "end"], [0, -10, "middle"], [0, 18, "middle"], [9, 16, "start"],
       [-9, 16, "end"], [9, -9, "start"], [-9, -9, "end"], [0, 31, "middle"], [10, 29, "start"], [-10, 29, "end"]]) {
       const left = px + dx - (anchor === "end" ? size : anchor === "middle" ? size / 2 : 0);
       const box = [left, py + dy - 11, left + size, py + dy + 3];
-      if (box[0] < PLANE.left || box[2] > width - 2 || box[1] < 8 || taken.some((other) => overlap(box, other))) continue;
+      if (box[0] < PLANE.left || box[2] > width - 2 || box[1] < 8 || box[3] > y.from || taken.some((other) => overlap(box, other))) continue;
       taken.push(box);
       layer.append(svg("text", { x: px + dx, y: py + dy, "text-anchor": anchor, class: row.method === state.method ? "chosen" : null },
         row.method));

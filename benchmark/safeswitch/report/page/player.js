@@ -1,6 +1,6 @@
 // One episode: the signal's trace with t0, handover, t* and the driver's colour, and the film where there is one.
 
-const TRACE = { height: 250, left: 52, right: 16, top: 44, bottom: 66 };
+const TRACE = { height: 263, left: 52, right: 16, top: 57, bottom: 66 };
 
 // Entries of the select: filmed drivers first, then the episodes of the slider's view.
 function drawEpisodes(state) {
@@ -158,11 +158,12 @@ function drawEvents(root, episode, x, dt) {
     ["t* first", episode.first, "star"],
     ["t* last", episode.last === episode.first ? -1 : episode.last, "star"],
   ].filter(([, step]) => step >= 0 && step < episode.horizon).sort((a, b) => a[1] - b[1]);
-  const taken = [];
+  const taken = [[0, x.from - 38 + widthOf(episode.signal, "italic 12px"), 0]]; // the name of the axis
   for (const [name, step, css] of events) {
     const px = x(step * dt);
-    const level = [0, 1, 2].find((row) => !taken.some(([other, its]) => its === row && Math.abs(other - px) < 62)) ?? 0;
-    taken.push([px, level]);
+    const half = widthOf(name, "600 12px") / 2;
+    const level = [0, 1, 2, 3].find((row) => !taken.some(([from, to, its]) => its === row && px - half < to + 4 && px + half > from - 4)) ?? 3;
+    taken.push([px - half, px + half, level]);
     root.append(svg("line", { class: `event ${css}`, x1: px, x2: px, y1: TRACE.top - 4, y2: TRACE.height - TRACE.bottom }));
     root.append(svg("text", { class: `event ${css}`, x: px, y: TRACE.top - 8 - 13 * level, "text-anchor": "middle" }, name));
   }

@@ -51,7 +51,9 @@ function ticks(at, wanted = 5) {
 function text(value, digits = 3) {
   if (Number.isNaN(value)) return "–";
   if (!Number.isFinite(value)) return value > 0 ? "∞" : "−∞";
-  const plain = Math.abs(value) >= 1e4 ? value.toFixed(0) : Number(value.toPrecision(digits)).toString();
+  const short = Number(value.toPrecision(digits));
+  const tiny = short !== 0 && Math.abs(short) < 1e-4; // as 2e−6, which is not wider than the room beside an axis
+  const plain = Math.abs(value) >= 1e4 ? value.toFixed(0) : tiny ? short.toExponential() : short.toString();
   return plain.replace("-", "−");
 }
 
@@ -59,18 +61,35 @@ function fixed(value, digits) {
   return Number.isNaN(value) ? "–" : value.toFixed(digits).replace("-", "−");
 }
 
-// Axes of a chart: grid, tick labels, names.
+// Width of words in a chart [px]; fonts differ between machines.
+const PEN = document.createElement("canvas").getContext("2d");
+function widthOf(words, style = "12px") {
+  PEN.font = `${style} ${getComputedStyle(document.body).fontFamily}`;
+  return PEN.measureText(words).width;
+}
+
+// The first of some names, longest first, that fits in a width [px]; the last if none does.
+function fitting(names, width) {
+  return names.find((name) => widthOf(name, "italic 12px") <= width) ?? names.at(-1);
+}
+
+// Axes of a chart: grid, tick labels, names; of a list of names for x, the longest for which there is room.
 function axes(root, x, y, { xName, yName, xText = text, yText = text, xTicks = 6, yTicks = 5 }) {
   const grid = svg("g", { class: "grid" });
+  let written = -Infinity; // where the last number ends: one that has no room is left out, its line is drawn
   for (const value of ticks(x, xTicks)) {
     grid.append(svg("line", { x1: x(value), x2: x(value), y1: y.from, y2: y.to }));
+    const half = widthOf(xText(value)) / 2;
+    if (x(value) - half < written + 3) continue;
+    written = x(value) + half;
     grid.append(svg("text", { x: x(value), y: y.from + 16, "text-anchor": "middle" }, xText(value)));
   }
   for (const value of ticks(y, yTicks)) {
     grid.append(svg("line", { x1: x.from, x2: x.to, y1: y(value), y2: y(value) }));
     grid.append(svg("text", { x: x.from - 8, y: y(value) + 4, "text-anchor": "end" }, yText(value)));
   }
-  if (xName) grid.append(svg("text", { x: x.to, y: y.from + 33, "text-anchor": "end", class: "axis" }, xName));
+  if (xName) grid.append(svg("text", { x: x.to, y: y.from + 33, "text-anchor": "end", class: "axis" },
+    fitting([xName].flat(), x.to)));
   if (yName) grid.append(svg("text", { x: x.from - 8, y: y.to - 10, "text-anchor": "start", class: "axis", dx: -30 }, yName));
   root.append(grid);
 }

@@ -54,7 +54,8 @@ function drawSweep(state) {
   const root = svg("svg", { viewBox: `0 0 ${width} ${height}`, width, height, role: "img", "aria-labelledby": "sweep-caption" });
   drawMargins(root, x, view, bottom);
   axes(root, x, y, { yName: "share", xTicks: 6, xText: () => "" });
-  axes(root, x, y2, { xName: `threshold on ${view.signal}${axis[2] ? " (log scale)" : ""}`, yName: "return", xTicks: 6, yTicks: 3 });
+  const name = `threshold on ${view.signal}`;
+  axes(root, x, y2, { xName: [`${name}${axis[2] ? " (log scale)" : ""}`, name, view.signal], yName: "return", xTicks: 6, yTicks: 3 });
   if (!Number.isNaN(zero)) root.append(svg("line", { class: "zero", x1: x.from, x2: x.to, y1: y2(zero), y2: y2(zero) }));
   for (const [key] of CURVES) root.append(line(x, y, sweep.thresholds, sweep[key], { class: `curve ${key}` }));
   root.append(line(x, y2, sweep.thresholds, sweep.return_mean, { class: "curve return" }));
