@@ -26,7 +26,8 @@ from safeswitch.interrupts import for_this_process_alone
 from safeswitch.pipeline import Run
 from safeswitch.scoring.leaderboard import read_csv
 from safeswitch.store import Store
-from safeswitch.summary import announcement, headline
+from safeswitch.suite import TASKS, Task
+from safeswitch.summary import announcement, headline, headline_table
 
 CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f\x9b]")  # all but newline and tab; \r and \x1b are among them
 
@@ -200,11 +201,13 @@ def test_the_announcement_says_how_long_and_where(tmp_path: Path) -> None:
     assert "unknown" in "\n".join(unknown)
 
 
-def test_the_headline_is_that_of_the_committed_leaderboard() -> None:
+@pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
+def test_the_headline_is_that_of_the_committed_leaderboard(task: Task) -> None:
     path = Path(__file__).resolve().parents[1] / "results" / "leaderboard.csv"
     if not path.is_file():
         pytest.skip("needs the committed results")
-    rows = headline(TASK, read_csv(path))
+    rows = headline(task, read_csv(path))
+    assert headline_table(rows).row_count == len(rows) + 2, "a line for each protocol and each method"
     by = {(row["protocol"], row["method"]): row for row in rows}
     for protocol in ("onset", "start"):
         best = [row for row in rows if row["protocol"] == protocol and "best rule" in row["role"]]

@@ -15,7 +15,7 @@ from safeswitch import durations, registry
 from safeswitch.console import duration
 from safeswitch.scoring.leaderboard import read_csv
 from safeswitch.scoring.markdown import PAPER_METHOD, standing
-from safeswitch.scoring.metrics import REFERENCES
+from safeswitch.scoring.metrics import OTHERS, REFERENCES
 from safeswitch.suite import Task, methods
 
 if TYPE_CHECKING:
@@ -69,6 +69,8 @@ def headline(task: Task, table: pd.DataFrame) -> list[dict[str, Any]]:
     """The paper's cell under each protocol: references, the paper's rule, the best rule and the bound of hindsight."""
     cell, rows = task.paper_cell, []
     table = table[(table["task"] == task.name) & (table["disturbance"] == cell.disturbance)]
+    if "calibrated_on" in table:
+        table = table[table["calibrated_on"] != OTHERS]
     makers = {name: registry.make_method(name) for name in methods(task.signals)}
     privileged = [name for name, maker in makers.items() if "privileged" in maker.needs]
     give_back = [name for name, maker in makers.items() if not maker.latched]
