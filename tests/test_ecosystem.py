@@ -73,7 +73,8 @@ def test_videos_are_recorded(env_id: str, tmp_path: Path) -> None:
     import imageio.v3 as iio
 
     frames = iio.imread(film, plugin="FFMPEG")
-    assert len(frames) == steps + 1 and frames.std() > 1
+    # moviepy counts in floating-point seconds, and may show the last frame twice.
+    assert len(frames) in (steps + 1, steps + 2) and frames.std() > 1
 
 
 @pytest.mark.parametrize("env_id", IDS)

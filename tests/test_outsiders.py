@@ -15,7 +15,7 @@ import pytest
 
 from micro import MICRO, TASK, micro_run
 from safeswitch import factories, registry, stages, suite
-from safeswitch.evaluation import check_rule, check_signals, evaluate, with_method
+from safeswitch.evaluation import check_rule, check_signals, evaluate, score_rows, with_method
 from safeswitch.handover.panel import Panel
 from safeswitch.pipeline import Run
 from safeswitch.protocols import Learner, LearnerFactory, Method, Prediction, SwitchRule
@@ -259,6 +259,12 @@ def test_the_examples_satisfy_the_protocols(monkeypatch: pytest.MonkeyPatch) -> 
     calibrated = method.calibrate(random_calibration(1, "onset"))
     assert isinstance(calibrated.rule, SwitchRule)
     check_rule("my_rule:RisingSignal@total", method, calibrated, panel)
+
+
+def test_scores_are_shown_with_their_intervals_and_none_is_left_out() -> None:
+    scores = {"task": "cart-pole", "method": "timer", "return_mean": 5.25, "return_lo": 5.125, "return_hi": 5.5}
+    scores |= {"skill": np.nan, "skill_lo": np.nan, "skill_hi": np.nan, "missed": 3, "calibrated_on": ""}
+    assert score_rows(scores) == [("return_mean", "5.25", "5.125 to 5.5"), ("skill", "–", ""), ("missed", "3", "")]
 
 
 def test_what_is_no_task_is_refused(outsider: Path) -> None:

@@ -146,8 +146,9 @@ def rename(content: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (set_score("return_mean", 5.9), "inconsistent: scores.return_mean is 5.9 and its episodes give"),
-        (set_score("success", 1.0), "inconsistent: scores.success is 1.0 and its episodes give"),
+        (set_score("return_mean", 5.9), "inconsistent: scores.return_mean is 5.9, but the episodes in cart-pole/"),
+        (set_score("success", 1.0), "inconsistent: scores.success is 1.0, but the episodes in .* give"),
+        (set_score("calibrated_on", "cart-pole/none"), "inconsistent: scores.calibrated_on is not blank"),
         (set_score("success_lo", 0.99), "inconsistent: scores.success_lo"),
         (set_score("autonomy", None), "inconsistent: scores.autonomy is nan"),
         (set_score("glory", 1.0), r"malformed: the scores \['glory'\] are unknown"),

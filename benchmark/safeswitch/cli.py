@@ -123,14 +123,17 @@ class Evaluate:
 
     def run(self) -> None:
         """Do it."""
+        from safeswitch.evaluation import score_rows
+
         if self.contestant.learner and not self.common.task:
             raise ValueError("a learner is for one task: add --task, for example --task cart-pole")
         rows, shown = {}, []
         for run in self.common.runs():
             found = self.contestant.evaluate(run)
-            table = Table("score", "value", title=f"{found.run.task.learner} with {found.method} in {found.cell}")
-            for name, value in found.scores.items():
-                table.add_row(str(name), f"{value:.4g}" if isinstance(value, float) else str(value))
+            title = f"{found.run.task.learner} with {found.method} in {found.cell} ({found.protocol})"
+            table = Table("score", "value", "95 % interval", title=escape(title))
+            for row in score_rows(found.scores):
+                table.add_row(*row)
             rows[run.task.name] = found.scores
             shown.append(table)
         answer(rows, *shown)

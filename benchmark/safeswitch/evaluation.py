@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,7 @@ from safeswitch import factories, registry, scoring_stages, stages, trained
 from safeswitch.evaluate import checked_arming, find_cell
 from safeswitch.protocols import Arming, Driver
 from safeswitch.scoring.leaderboard import leaderboard
-from safeswitch.scoring.metrics import signal_of
+from safeswitch.scoring.metrics import CELL, signal_of
 from safeswitch.scoring.rows import latched_rows
 
 if TYPE_CHECKING:
@@ -45,6 +45,24 @@ class Evaluation:
     protocol: Arming
     episodes: pd.DataFrame
     scores: dict[str, Any]
+
+
+def score_rows(scores: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+    """Scores for people: (name, value, 95 % interval), with the interval beside its score and a dash for no value.
+
+    Args:
+        scores: the leaderboard's row.
+    """
+    rows = []
+    for name, value in scores.items():
+        if name in (*CELL, "method") or name.endswith(("_lo", "_hi")) or value == "":
+            continue
+        prefix = name.removesuffix("_mean")
+        bounds = [scores.get(f"{prefix}_{end}", np.nan) for end in ("lo", "hi")]
+        interval = "" if pd.isna(bounds).any() else f"{bounds[0]:.4g} to {bounds[1]:.4g}"
+        said = "–" if pd.isna(value) else f"{value:.4g}" if isinstance(value, float) else str(value)
+        rows.append((name, said, interval))
+    return rows
 
 
 def evaluate(

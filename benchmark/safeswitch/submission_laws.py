@@ -89,4 +89,5 @@ def _hold(law: str, frame: pd.DataFrame, holds: Any) -> None:
     if not holds.all():
         shown = ["method", *EPISODE, *TRAJECTORY, "handover", "learner_steps", "success"]
         row = frame.loc[~holds, shown].iloc[0]
-        raise ValueError(f"{int((~holds).sum())} episodes break the law {law!r}, the first: {row.to_dict()}")
+        first = ", ".join(f"{name} {value}" for name, value in row.items())
+        raise ValueError(f"{int((~holds).sum())} of {len(frame)} rows break the law {law!r}, the first: {first}")

@@ -172,7 +172,9 @@ def read(path: Path) -> Submission:
             f"{content['suite']['version']}, commit {content['suite']['commit']}); run and submit it again"
         )
     if content_hash(content["episodes"]) != content["hashes"]["episodes"]:
-        raise Refused("inconsistent: hashes.episodes is not the hash of the episodes")
+        raise Refused(
+            "inconsistent: hashes.episodes is not the hash of the episodes; these were changed after they were written"
+        )
     info = task_info(task)
     frame = _episodes(content, info)
     return Submission(path, content, _checked_scores(content, frame, str(cell), info), hashlib.sha256(data).hexdigest())
@@ -282,14 +284,14 @@ def _checked_scores(content: Mapping[str, Any], frame: pd.DataFrame, cell: str, 
         raise Refused(f"inconsistent: {error}") from error
     row = dict(table[table["method"] == content["method"]["rule"]].iloc[0])
     scores, stated = {key: value for key, value in row.items() if key not in UNSCORED}, dict(content["scores"])
-    stated.pop("calibrated_on", None)
+    if stated.pop("calibrated_on", "") != "":
+        raise Refused("inconsistent: scores.calibrated_on is not blank, but every method is calibrated in its own cell")
     for key, value in scores.items():
         given = stated.pop(key, None)
         given = float("nan") if given is None else given
         if isinstance(given, bool) or not isinstance(given, NUMBER + TEXT) or _spelled(given) != _spelled(value):
-            raise Refused(
-                f"inconsistent: scores.{key} is {given!r} and its episodes give {_spelled(value) or 'no value'}, {cell}"
-            )
+            follows = _spelled(value) or "no value"
+            raise Refused(f"inconsistent: scores.{key} is {given!r}, but the episodes in {cell} give {follows}")
     if stated:
         raise Refused(f"malformed: the scores {sorted(stated)} are unknown")
     return row
