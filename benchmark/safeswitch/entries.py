@@ -46,13 +46,10 @@ class Cell:
         """Whether thresholds are also calibrated on the other disturbances: severity 3 of what does harm."""
         return self.severity == 3 and self.tag in ("paper", "other")
 
-    def complete(self, split: Split, published: bool) -> bool:
-        """Whether every outcome is computed in advance.
-
-        So it is of calibrate tables, which many rules and cells come back to, and of tables that are `published`.
-        """
+    def complete(self, split: Split) -> bool:
+        """Whether every outcome is computed in advance: of tables that many rules, cells or figures come back to."""
         first = (self.tag == "none" and not self.track) or (self.tag == "paper" and self.severity == 3)
-        return (first or self.left_out) if split == "calibrate" else (first and published)
+        return first or (self.left_out and split == "calibrate")
 
     @property
     def env_kwargs(self) -> dict[str, Any]:

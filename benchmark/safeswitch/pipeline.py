@@ -164,7 +164,7 @@ class Run:
                 for split in splits:
                     twins = chunks.get((trained.seed, task.undisturbed(cell), split), ())
                     seeds = self.profile.seeds_of(task, cell, split)
-                    jobs = table_jobs(self.store, task, cell, split, seeds, trained, twins, self.profile.tables)
+                    jobs = table_jobs(self.store, task, cell, split, seeds, trained, twins)
                     chunks[trained.seed, cell, split] = jobs
                     stage += jobs
             self.finish("handover tables", stage)
@@ -192,7 +192,7 @@ class Run:
                 cell,
                 trained,
                 tables[trained.seed, str(cell)],
-                methods_in(self.task, cell, self.profile.tables),
+                methods_in(self.task, cell),
                 self._gives_back(cell),
             )
             for trained in self.trained

@@ -59,12 +59,12 @@ def episodes_job(
     return Job("episodes", f"{cell} learner {trained.seed}", key, _score_episodes, arguments)
 
 
-def methods_in(task: Task, cell: Cell, published: bool) -> tuple[str, ...]:
+def methods_in(task: Task, cell: Cell) -> tuple[str, ...]:
     """Methods that run in a cell. Those that train a network run in the first three cells; for `simplex` see
     `Task.costly`.
     """
     spared = set() if cell in task.cells[:3] else set(OPTIONAL)
-    if task.costly and not cell.complete("test", published):
+    if task.costly and not cell.complete("test"):
         spared.add("simplex")
     return tuple(name for name in methods(task.rule_signals) if name not in spared)
 

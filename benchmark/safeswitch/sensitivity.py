@@ -162,7 +162,7 @@ def sensitivity_table(store: Store, task: Task, info: TaskInfo, jobs: list[Job])
 
 def latency_job(store: Store, task: Task, trained: Trained, tables: CellTables) -> Job:
     """Time from an observation to the driver of the next step, for every method, with one learner."""
-    ids = methods_in(task, task.paper_cell, published=True)
+    ids = methods_in(task, task.paper_cell)
     key = store.key("latency", {"methods": list(ids)}, [*trained.keys, *tables.keys], ["safeswitch.sensitivity"])
     return Job("latency", task.name, key, _time, (str(store.root), task, trained, tables, ids))
 

@@ -150,18 +150,17 @@ def table_jobs(
     seeds: Sequence[int] | int,
     trained: Trained,
     twins: Sequence[Job] = (),
-    published: bool = False,
 ) -> list[Job]:
     """The handover table of one (cell, learner) on episode seeds of a split (or its first ones), in chunks of episodes.
 
-    Outcomes are computed here for the tables that are used again and again, or `published` (`Cell.complete`);
-    elsewhere they are computed when a rule first asks for them. Where the disturbance is only seen, those up to the
-    onset are taken from `twins`, finished jobs of the undisturbed cell.
+    Outcomes are computed here for the tables that are used again and again (`Cell.complete`); elsewhere they are
+    computed when a rule first asks for them, but for those that every score asks for. Where the disturbance is only
+    seen, those up to the onset are taken from `twins`, finished jobs of the undisturbed cell.
     """
     twins = twins if only_seen(cell) else ()
     seeds = episode_seeds(split, seeds) if isinstance(seeds, int) else seeds
     code = [*PHYSICS, *task.code(), *HANDOVER, source_of("learner", task.learner), *signal_code(task)]
-    complete, jobs = cell.complete(split, published), []
+    complete, jobs = cell.complete(split), []
     for index, first in enumerate(range(0, len(seeds), CHUNK)):
         chunk = list(seeds[first : first + CHUNK])
         twin = [twins[index].key] if twins else []
@@ -195,6 +194,7 @@ def _tabulate(
         table.share(HandoverTable.load(Path(twin) / "table.npz"))
     if complete:
         table.complete()
+    _ = table.t_first, table.t_last  # scores of rules and of signals need these outcomes, each in a job of its own
     table.save(folder / "table.npz")
     env.close()
 
