@@ -15,6 +15,7 @@ const COLUMNS = [
   { key: "threshold", name: "Threshold", digits: 0, better: -1, title: "median over learners" },
   { key: "tuning_episodes", name: "Tuning", title: "episodes used to choose the threshold", digits: 0, better: 1 },
 ];
+const OTHERS = "other disturbances";
 const BAR = { width: 68, height: 20, edge: 3 };
 
 function reference(board) {
@@ -30,7 +31,7 @@ function drawBoard(state) {
   if ($("show").value === "lead" && !wanted)
     rows = rows.filter((row, i) => i < LEADING || ALWAYS.test(row.method) || row.method === state.method);
   rows.sort((a, b) => compare(a, b, sort));
-  const number = `${rows.length} of ${every.length} methods`;
+  const number = `${rows.length} of ${every.length} rows`;
   if ($("shown").textContent !== number) $("shown").textContent = number;
   $("board-caption").textContent = `${task.name}, ${cellTitle(state.cell)}, armed at ${state.protocol}: ` +
     `${board.learners} learner${board.learners > 1 ? "s" : ""}, ${board.episodes} test episodes`;
@@ -79,7 +80,7 @@ function barScale(column, rows, zero) {
 }
 
 function boardRow(row, state, scales, zero) {
-  const mark = row.traits.includes("privileged") ? "*" : row.traits.includes("returns") ? "↺" : "";
+  const mark = [row.traits.includes("privileged") ? "*" : row.traits.includes("returns") ? "↺" : "", strange(row)].join("");
   const icon = svg("svg", { viewBox: "-8 -8 16 16", width: 16, height: 16, "aria-hidden": "true" }, glyph(row.method));
   const chosen = row.method === state.method;
   const button = html("button", { type: "button", class: "method", "aria-pressed": String(chosen),
@@ -90,11 +91,15 @@ function boardRow(row, state, scales, zero) {
   return html("tr", { class: chosen ? "chosen" : null, "data-method": row.method, "data-on": row.on }, head, cells);
 }
 
+// The sign of thresholds that come from other disturbances than the one that is shown.
+const strange = ({ on }) => (on === OTHERS ? "†" : "");
+
 function boardCell(row, column, at, zero) {
   const value = row[column.key];
   const shown = column.key === "threshold" ? text(value) : fixed(value, column.digits);
   if (!at) return html("td", {}, shown);
-  if (column.key === "skill" && Number.isNaN(value)) return html("td", { class: "wide none" }, "no contest");
+  if (column.key === "skill" && Number.isNaN(value)) // a method without a signal has no best threshold to compare with
+    return html("td", { class: "wide none" }, row.method.includes("@") ? "no contest" : "–");
   const range = column.lo ? `${fixed(row[column.lo], 2)} to ${fixed(row[column.hi], 2)}` : null;
   return html("td", { class: "wide", title: range && `95 % interval ${range}` },
     html("span", { class: "value" }, shown), interval(row, column, at, zero),

@@ -99,7 +99,7 @@ function drawMarks(root, x, state, bottom) {
     layer.append(svg("line", { class: `stem ${css}`, x1: px, x2: px, y1: SWEEP.top - 6, y2: bottom }));
     const point = glyph(mark.method);
     point.setAttribute("transform", `translate(${px} ${SWEEP.top - 12})`);
-    point.append(svg("title", {}, `${mark.method} ${text(mark.value)}`));
+    point.append(svg("title", {}, `${mark.method}${strange(mark)} ${text(mark.value)}`));
     layer.append(point);
     for (const value of mark.values)
       if (mark.values.length > 1 && value > x.low && value < x.high)
@@ -122,7 +122,7 @@ function drawMarkButtons(state) {
   $("marks").replaceChildren(...state.marks.map((mark) => {
     const icon = svg("svg", { viewBox: "-8 -8 16 16", width: 14, height: 14, "aria-hidden": "true" }, glyph(mark.method));
     const button = html("button", { type: "button", "data-method": mark.method, "data-on": mark.on, "aria-pressed": "false" },
-      icon, mark.method.split("@")[0], html("span", { class: "hidden" }, `@${view.signal} at `), html("span", { class: "at" }, text(mark.value)));
+      icon, mark.method.split("@")[0] + strange(mark), html("span", { class: "hidden" }, `@${view.signal} at `), html("span", { class: "at" }, text(mark.value)));
     button.addEventListener("click", () => setMark(mark));
     return button;
   }));
