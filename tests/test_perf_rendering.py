@@ -25,7 +25,8 @@ def test_every_alternative_is_timed_and_compared() -> None:
     assert ("environment [frames/s]" in rates) == (results["model"] == perf_rendering.ENV_IDS[0])
     # A factor of ten and more on the processor; whatever draws, leaving work out is not slower.
     assert results["fast / bare default"] > 1
-    assert 0.3 < results["fast / bare fast"] < 3, "the same settings, by another hand"
+    # The same settings by another hand; a handful of frames on a busy machine is off by a factor of four now and then.
+    assert 0.1 < results["fast / bare fast"] < 10
 
 
 @pytest.mark.rendering

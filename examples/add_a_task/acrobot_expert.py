@@ -30,9 +30,9 @@ PARAMETERS = (
     "torque_limit",  # [N m] per unit of action
 )
 GRAVITY = 9.81  # [m/s^2]
-WEIGHT_ENERGY, WEIGHT_UPRIGHT, REACH, WEIGHT_ELBOW, WEIGHT_SPEED, WEIGHT_ACTION = 20.0, 50.0, 0.3, 5.0, (0.01, 0.4), 0.5
-WEIGHT_TERMINAL = 1.0
-HORIZON = 30
+WEIGHT_ANGLE, WEIGHT_SPEED, WEIGHT_ACTION = (5.0, 5.0), (0.05, 0.05), 0.5
+WEIGHT_TERMINAL = 10.0
+HORIZON = 50
 SWINGS = (2.0, 3.0, 4.0, 5.5)
 """Frequencies of the first guesses of a cold start [rad/s]; each is tried to both sides."""
 
@@ -64,19 +64,10 @@ def dynamics(control_dt: float, substeps: int = 2) -> ca.Function:
 def residuals() -> tuple[ca.Function, ca.Function]:
     """Stage residual (x, u, p) -> r and terminal residual (x, p) -> r_N; the cost is 0.5 |r|^2."""
     x, u, p = ca.MX.sym("x", 4), ca.MX.sym("u", 1), ca.MX.sym("p", len(PARAMETERS))
-    m1, m2, c1, c2, i1, i2, length, _, _, _ = ca.vertsplit(p)
-    q1, q2, v1, v2 = ca.vertsplit(x)
-    m12, m22 = i2 + m2 * c2**2 + m2 * length * c2 * ca.cos(q2), i2 + m2 * c2**2
-    m11 = i1 + m1 * c1**2 + m2 * length**2 + 2 * m12 - m22
-    kinetic = m11 * v1**2 / 2 + m12 * v1 * v2 + m22 * v2**2 / 2
-    highest = (m1 * c1 + m2 * length + m2 * c2) * GRAVITY
-    missing = highest - (m1 * c1 + m2 * length) * GRAVITY * ca.cos(q1) - m2 * c2 * GRAVITY * ca.cos(q1 + q2)
-    rows = [np.sqrt(WEIGHT_ENERGY) * (kinetic - missing) / highest]
-    away = 2 * (1 - ca.cos(q1)) + 2 * (1 - ca.cos(q1 + q2))
-    near = ca.sqrt(WEIGHT_UPRIGHT / (1 + away / REACH))
-    for angle, weight in ((q1, near), (q1 + q2, near), (q2, np.sqrt(WEIGHT_ELBOW))):
-        rows += [weight * ca.sin(angle), weight * (1 - ca.cos(angle))]
-    rows += [np.sqrt(weight) * speed for speed, weight in zip((v1, v2), WEIGHT_SPEED, strict=True)]
+    rows = []
+    for angle, weight in zip((x[0], x[0] + x[1]), WEIGHT_ANGLE, strict=True):
+        rows += [np.sqrt(weight) * ca.sin(angle), np.sqrt(weight) * (1 - ca.cos(angle))]
+    rows += [np.sqrt(weight) * speed for speed, weight in zip((x[2], x[3]), WEIGHT_SPEED, strict=True)]
     state = ca.vertcat(*rows)
     stage = ca.Function("acrobot_residual", [x, u, p], [ca.vertcat(state, np.sqrt(WEIGHT_ACTION) * u)])
     return stage, ca.Function("acrobot_terminal", [x, p], [np.sqrt(WEIGHT_TERMINAL) * state])
