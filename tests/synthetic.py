@@ -42,18 +42,27 @@ def calibration(disturbed: HandoverTable, nominal: HandoverTable, arming: Arming
     return Calibration(Panel(table, arming), nominal, seed=seed)
 
 
-def cliff_table(edge: float, episodes: int = 40, disturbed: bool = True, seed: int = 0, T: int = 80) -> HandoverTable:
+def cliff_table(
+    edge: float,
+    episodes: int = 40,
+    disturbed: bool = True,
+    seed: int = 0,
+    T: int = 80,
+    noise: float = 0.3,
+    rates: tuple[float, float] = (0.03, 0.05),
+) -> HandoverTable:
     """Episodes that succeed for exactly the thresholds below `edge`; the learner alone fails every disturbed one.
 
     The signal is a twentieth of the edge until t0, grows from there to one and a half times the edge, and equals the
     edge at the step whose alarm is the last one in time. The later the handover the higher the return, so it grows with
-    the threshold and drops at the edge.
+    the threshold and drops at the edge. `noise` is the standard deviation of its logarithm before t0; `rates` are the
+    slowest and the fastest growth of it, in ln 40 a step.
     """
     rng = np.random.default_rng(seed)
     onset = rng.integers(8, 40, episodes) if disturbed else np.full(episodes, -1)
     step = np.arange(T)[None, :]
-    trace = edge * 0.05 * np.exp(0.3 * rng.standard_normal((episodes, T)))
-    rate = rng.uniform(0.03, 0.05, (episodes, 1)) * np.log(40)
+    trace = edge * 0.05 * np.exp(noise * rng.standard_normal((episodes, T)))
+    rate = rng.uniform(*rates, (episodes, 1)) * np.log(40)
     growth = edge * 0.05 * np.exp(rate * np.clip(step - onset[:, None], 0, None))
     trace = np.where(disturbed & (step >= onset[:, None]), np.minimum(growth, 1.5 * edge), trace)
     last = np.argmax(trace > edge, axis=1) - 1

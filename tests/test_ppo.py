@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from safeswitch import registry, suite
 from safeswitch.handover.panel import Panel
 from safeswitch.handover.table import HandoverTable
 from safeswitch.protocols import Calibrated, Driver
-from safeswitch_baselines.rules.ppo import PolicyRule, PPORule, Scale
+from safeswitch_baselines.rules.ppo import LARGEST, PolicyRule, PPORule, Scale
 from synthetic import calibration, cliff_table, random_table
 
 STANDARD = Scale(np.zeros(1), np.ones(1))
@@ -60,10 +61,16 @@ def test_without_the_extra_it_is_left_out_and_says_how_to_get_it(monkeypatch: py
 
 
 def train(arming: str, seed: int = 0) -> tuple[Calibrated, Panel]:
-    """A policy for the cliff, and other episodes to test it on."""
+    """A policy for the cliff, and other episodes to test it on.
+
+    The cliff, a factor of 20 above the undisturbed signal, is within what the policy is shown (`LARGEST` standard
+    deviations), and its time differs so much between episodes that it takes the signal to earn more than a timer.
+    """
+    assert np.log(20) < 0.75 * LARGEST
+    make = partial(cliff_table, 0.3, noise=0.75, rates=(0.025, 0.1))
 
     def split(seed: int) -> tuple[HandoverTable, HandoverTable]:
-        return cliff_table(0.3, seed=seed), cliff_table(0.3, disturbed=False, seed=seed)
+        return make(seed=seed), make(disturbed=False, seed=seed)
 
     calibrated = registry.make_method("ppo@signals").calibrate(calibration(*split(0), arming, seed))  # type: ignore[arg-type]
     return calibrated, calibration(*split(1), arming).panel  # type: ignore[arg-type]

@@ -16,6 +16,7 @@ from safeswitch.expert.bicycle import CONTEXT, GRAVITY, KNOTS, PARAMETERS, STEER
 from safeswitch.expert.rally_car_model import CurvatureWindow, RallyCarExpert, make_rally_car_expert
 from safeswitch.protocols import Expert
 from safeswitch.seeding import stream
+from safeswitch.tasks.rally_car_config import HORIZON
 from safeswitch.tasks.track import TRACKS, Track
 
 Array = NDArray[np.float64]
@@ -491,7 +492,7 @@ def test_handovers_succeed() -> None:
 @pytest.mark.rendering
 def test_first_gate_handover_at_every_fifth_step() -> None:
     outcomes = handovers(range(200), 5)
-    assert len(outcomes) >= 200 * 23
+    assert len(outcomes) == 200 * HORIZON // 5
     assert np.mean(outcomes) >= 0.995
 
 
