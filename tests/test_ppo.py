@@ -97,3 +97,9 @@ def test_it_learns_to_hand_over_before_the_cliff(arming: str) -> None:
         assert (weight != different).any()
     renamed = replace(panel.table, seeds=panel.table.seeds + 1)
     np.testing.assert_array_equal(Panel(renamed, panel.arming).handover_of(calibrated.rule), handover)
+
+
+def test_it_is_left_out_where_every_episode_ends_before_the_rule_is_armed() -> None:
+    early = random_table(0)
+    early = replace(early, onset=early.length.copy())
+    assert PPORule("signals").calibrate(calibration(early, random_table(1, 6, False), "onset")).rule is None

@@ -92,7 +92,10 @@ class PolicyRule:
 
 
 class PPORule(SignalMethod):
-    """`ppo@signals`: PPO on the calibrate episodes, with a fixed number of steps."""
+    """`ppo@signals`: PPO on the calibrate episodes, with a fixed number of steps.
+
+    Left out where no calibrate episode lasts until the rule is armed: there is nothing to learn from.
+    """
 
     family = "ppo"
     needs = frozenset({"failures", "rollouts"})
@@ -100,6 +103,8 @@ class PPORule(SignalMethod):
     def calibrate(self, calibration: Calibration) -> Calibrated:
         """Train a policy; the draws of episodes and of torch come from streams of the calibration's seed."""
         panel = calibration.panel
+        if (panel.arming_step >= panel.table.length).all():
+            return Calibrated(None)
         names = tuple(panel.table.signals) if self.signal == ALL else (self.signal,)
         games = HandoverVectorEnv(Decisions(panel, names, HISTORY, calibration.phi), num_envs=64)
         scale = Scale.fit(calibration.nominal, names)
