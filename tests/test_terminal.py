@@ -207,7 +207,11 @@ def test_the_headline_is_that_of_the_committed_leaderboard(task: Task) -> None:
     if not path.is_file():
         pytest.skip("needs the committed results")
     rows = headline(task, read_csv(path))
-    assert headline_table(rows).row_count == len(rows) + 2, "a line for each protocol and each method"
+    shown = headline_table(rows)
+    assert shown.row_count == len(rows) + 2, "a line for each protocol and each method"
+    console = Console(file=io.StringIO(), width=80)
+    console.print(shown)
+    assert "…" not in console.file.getvalue(), "whole in 80 columns"  # type: ignore[attr-defined]
     by = {(row["protocol"], row["method"]): row for row in rows}
     for protocol in ("onset", "start"):
         best = [row for row in rows if row["protocol"] == protocol and "best rule" in row["role"]]

@@ -101,7 +101,7 @@ def headline_table(rows: Sequence[dict[str, Any]]) -> Table:
     for (cell, protocol, episodes), group in groupby(rows, key=itemgetter("cell", "protocol", "episodes")):
         if table.rows:
             table.add_section()
-        table.add_row(f"{cell}, armed at {protocol}", f"{episodes:.0f} episodes", style="bold")
+        table.add_row(f"{cell}, {protocol}", f"n = {episodes:.0f}", style="bold")
         for row in group:
             numbers = (f"{row['return_mean']:.2f}", f"{row['success']:.2f}", f"{row['autonomy']:.2f}")
             table.add_row(f"  {row['method']}", row["role"], *numbers, style="green" if "best" in row["role"] else "")
