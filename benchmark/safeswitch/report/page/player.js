@@ -162,10 +162,11 @@ function drawEvents(root, episode, x, dt) {
   for (const [name, step, css] of events) {
     const px = x(step * dt);
     const half = widthOf(name, "600 12px") / 2;
-    const level = [0, 1, 2, 3].find((row) => !taken.some(([from, to, its]) => its === row && px - half < to + 4 && px + half > from - 4)) ?? 3;
-    taken.push([px - half, px + half, level]);
+    const at = Math.min(px, x.to + TRACE.right - half - 1); // beside its line rather than cut off
+    const level = [0, 1, 2, 3].find((row) => !taken.some(([from, to, its]) => its === row && at - half < to + 4 && at + half > from - 4)) ?? 3;
+    taken.push([at - half, at + half, level]);
     root.append(svg("line", { class: `event ${css}`, x1: px, x2: px, y1: TRACE.top - 4, y2: TRACE.height - TRACE.bottom }));
-    root.append(svg("text", { class: `event ${css}`, x: px, y: TRACE.top - 8 - 13 * level, "text-anchor": "middle" }, name));
+    root.append(svg("text", { class: `event ${css}`, x: at, y: TRACE.top - 8 - 13 * level, "text-anchor": "middle" }, name));
   }
 }
 
