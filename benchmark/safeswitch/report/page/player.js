@@ -1,6 +1,6 @@
 // One episode: the signal's trace with t0, handover, t* and the driver's colour, and the film where there is one.
 
-const TRACE = { height: 263, left: 52, right: 16, top: 57, bottom: 66 };
+const TRACE = { height: 269, left: 52, right: 16, top: 63, bottom: 66 };
 
 // Entries of the select: filmed drivers first, then the episodes of the slider's view.
 function drawEpisodes(state) {
