@@ -43,11 +43,14 @@ function planeScales(rows, state, width, height) {
   ];
 }
 
+// A method stands twice where it was calibrated on other disturbances too; that one carries the leaderboard's sign.
+const signed = (row) => row.method + (strange(row) && ` ${strange(row)}`);
+
 function planePoint(row, state, x, y, index, count) {
   const chosen = row.method === state.method;
   const point = glyph(row.method);
   const label = `${row.method}: success ${fixed(row.success, 3)}, autonomy ${fixed(row.autonomy, 3)}, ` +
-    `return ${fixed(row.return_mean, 2)}`;
+    `return ${fixed(row.return_mean, 2)}${row.on ? `, calibrated on ${row.on}` : ""}`;
   filled(point, {
     transform: `translate(${x(row.autonomy).toFixed(1)} ${y(row.success).toFixed(1)})${chosen ? " scale(1.5)" : ""}`,
     role: "button", tabindex: index === 0 ? 0 : -1, "aria-label": `${label}, point ${index + 1} of ${count}`,
@@ -73,6 +76,7 @@ function planePoint(row, state, x, y, index, count) {
 function tipOf(row) {
   return [
     html("b", {}, row.method), html("br"),
+    ...(row.on ? [`calibrated on ${row.on}`, html("br")] : []),
     `success ${fixed(row.success, 3)} [${fixed(row.success_lo, 2)}, ${fixed(row.success_hi, 2)}]`, html("br"),
     `autonomy ${fixed(row.autonomy, 3)}`, html("br"), `return ${fixed(row.return_mean, 2)}`,
     ...(Number.isNaN(row.threshold) ? [] : [html("br"), `threshold ${text(row.threshold)}`]),
@@ -99,11 +103,11 @@ function roving(layer) {
 function planeLabels(points, state, x, y, width) {
   const layer = svg("g", { class: "labels", "aria-hidden": "true" });
   const taken = points.map((row) => [x(row.autonomy) - 6, y(row.success) - 6, x(row.autonomy) + 6, y(row.success) + 6]);
-  const rank = (row) => row.method === state.method ? 0 : NAMED.test(row.method) ? 1 : row.method === `cem@${state.signal}` ? 2
+  const rank = (row) => strange(row) ? row.method === state.method ? 1 : 9 : row.method === state.method ? 0 : NAMED.test(row.method) ? 1 : row.method === `cem@${state.signal}` ? 2
     : row.method === `best@${state.signal}` ? 3 : row.method.endsWith(`@${state.signal}`) ? 4 : 9;
   for (const row of [...points].sort((a, b) => rank(a) - rank(b))) {
     if (rank(row) > 4) break;
-    const [px, py, size] = [x(row.autonomy), y(row.success), widthOf(row.method, row.method === state.method ? "bold 11.5px" : "11.5px")];
+    const [px, py, size] = [x(row.autonomy), y(row.success), widthOf(signed(row), row.method === state.method ? "bold 11.5px" : "11.5px")];
     for (const [dx, dy, anchor] of [[9, 4, "start"], [-9, 4, "end"], [0, -10, "middle"], [0, 18, "middle"], [9, 16, "start"],
       [-9, 16, "end"], [9, -9, "start"], [-9, -9, "end"], [0, 31, "middle"], [10, 29, "start"], [-10, 29, "end"]]) {
       const left = px + dx - (anchor === "end" ? size : anchor === "middle" ? size / 2 : 0);
@@ -111,7 +115,7 @@ function planeLabels(points, state, x, y, width) {
       if (box[0] < PLANE.left || box[2] > width - 2 || box[1] < 8 || box[3] > y.from || taken.some((other) => overlap(box, other))) continue;
       taken.push(box);
       layer.append(svg("text", { x: px + dx, y: py + dy, "text-anchor": anchor, class: row.method === state.method ? "chosen" : null },
-        row.method));
+        signed(row)));
       break;
     }
   }
