@@ -16,7 +16,7 @@ from safeswitch.console import duration
 from safeswitch.scoring.leaderboard import read_csv
 from safeswitch.scoring.markdown import PAPER_METHOD, standing
 from safeswitch.scoring.metrics import OTHERS, REFERENCES
-from safeswitch.suite import Task, methods
+from safeswitch.suite import Task
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -71,7 +71,7 @@ def headline(task: Task, table: pd.DataFrame) -> list[dict[str, Any]]:
     table = table[(table["task"] == task.name) & (table["disturbance"] == cell.disturbance)]
     if "calibrated_on" in table:
         table = table[table["calibrated_on"] != OTHERS]
-    makers = {name: registry.make_method(name) for name in methods(task.signals)}
+    makers = {name: registry.make_method(name) for name in table["method"].unique()}
     privileged = [name for name, maker in makers.items() if "privileged" in maker.needs]
     give_back = [name for name, maker in makers.items() if not maker.latched]
     for protocol, part in table[table["severity"] == cell.severity].groupby("protocol"):
