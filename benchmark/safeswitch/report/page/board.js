@@ -84,7 +84,7 @@ function boardRow(row, state, scales, zero) {
   const icon = svg("svg", { viewBox: "-8 -8 16 16", width: 16, height: 16, "aria-hidden": "true" }, glyph(row.method));
   const chosen = row.method === state.method;
   const button = html("button", { type: "button", class: "method", "aria-pressed": String(chosen),
-    title: row.on ? `calibrated on ${row.on}` : null }, row.method);
+    title: origin(row) }, row.method);
   button.addEventListener("click", () => chooseMethod(row.method));
   const head = html("th", { scope: "row" }, icon, button, mark && html("span", { class: "sign" }, mark));
   const cells = COLUMNS.map((column) => boardCell(row, column, scales[column.key], zero));
@@ -93,6 +93,7 @@ function boardRow(row, state, scales, zero) {
 
 // The sign of thresholds that come from other disturbances than the one that is shown.
 const strange = ({ on }) => (on === OTHERS ? "†" : "");
+const origin = ({ on }) => (on ? `calibrated on ${on}` : null);
 
 function boardCell(row, column, at, zero) {
   const value = row[column.key];

@@ -50,7 +50,7 @@ function planePoint(row, state, x, y, index, count) {
   const chosen = row.method === state.method;
   const point = glyph(row.method);
   const label = `${row.method}: success ${fixed(row.success, 3)}, autonomy ${fixed(row.autonomy, 3)}, ` +
-    `return ${fixed(row.return_mean, 2)}${row.on ? `, calibrated on ${row.on}` : ""}`;
+    `return ${fixed(row.return_mean, 2)}${row.on ? `, ${origin(row)}` : ""}`;
   filled(point, {
     transform: `translate(${x(row.autonomy).toFixed(1)} ${y(row.success).toFixed(1)})${chosen ? " scale(1.5)" : ""}`,
     role: "button", tabindex: index === 0 ? 0 : -1, "aria-label": `${label}, point ${index + 1} of ${count}`,
@@ -76,7 +76,7 @@ function planePoint(row, state, x, y, index, count) {
 function tipOf(row) {
   return [
     html("b", {}, row.method), html("br"),
-    ...(row.on ? [`calibrated on ${row.on}`, html("br")] : []),
+    ...(row.on ? [origin(row), html("br")] : []),
     `success ${fixed(row.success, 3)} [${fixed(row.success_lo, 2)}, ${fixed(row.success_hi, 2)}]`, html("br"),
     `autonomy ${fixed(row.autonomy, 3)}`, html("br"), `return ${fixed(row.return_mean, 2)}`,
     ...(Number.isNaN(row.threshold) ? [] : [html("br"), `threshold ${text(row.threshold)}`]),
@@ -99,23 +99,38 @@ function roving(layer) {
   });
 }
 
-// Names beside the points that matter most, where they fit.
+// Who gets a name beside its point first: the smaller, the sooner; from `UNNAMED` on nobody does.
+const UNNAMED = 9;
+function rankOf(row, state) {
+  const chosen = row.method === state.method;
+  if (strange(row)) return chosen ? 1 : UNNAMED;
+  if (chosen) return 0;
+  if (NAMED.test(row.method)) return 1;
+  const wanted = [`cem@${state.signal}`, `best@${state.signal}`].indexOf(row.method);
+  if (wanted >= 0) return 2 + wanted;
+  return row.method.endsWith(`@${state.signal}`) ? 4 : UNNAMED;
+}
+
+// Where a name may stand: beside its point, above, below; the first that is free.
+const PLACES = [[9, 4, "start"], [-9, 4, "end"], [0, -10, "middle"], [0, 18, "middle"], [9, 16, "start"], [-9, 16, "end"],
+  [9, -9, "start"], [-9, -9, "end"], [0, 31, "middle"], [10, 29, "start"], [-10, 29, "end"]];
+const BEFORE = { start: 0, middle: 0.5, end: 1 };
+
 function planeLabels(points, state, x, y, width) {
   const layer = svg("g", { class: "labels", "aria-hidden": "true" });
   const taken = points.map((row) => [x(row.autonomy) - 6, y(row.success) - 6, x(row.autonomy) + 6, y(row.success) + 6]);
-  const rank = (row) => strange(row) ? row.method === state.method ? 1 : 9 : row.method === state.method ? 0 : NAMED.test(row.method) ? 1 : row.method === `cem@${state.signal}` ? 2
-    : row.method === `best@${state.signal}` ? 3 : row.method.endsWith(`@${state.signal}`) ? 4 : 9;
-  for (const row of [...points].sort((a, b) => rank(a) - rank(b))) {
-    if (rank(row) > 4) break;
-    const [px, py, size] = [x(row.autonomy), y(row.success), widthOf(signed(row), row.method === state.method ? "bold 11.5px" : "11.5px")];
-    for (const [dx, dy, anchor] of [[9, 4, "start"], [-9, 4, "end"], [0, -10, "middle"], [0, 18, "middle"], [9, 16, "start"],
-      [-9, 16, "end"], [9, -9, "start"], [-9, -9, "end"], [0, 31, "middle"], [10, 29, "start"], [-10, 29, "end"]]) {
-      const left = px + dx - (anchor === "end" ? size : anchor === "middle" ? size / 2 : 0);
+  const named = points.map((row) => ({ row, rank: rankOf(row, state) })).filter(({ rank }) => rank < UNNAMED);
+  for (const { row } of named.sort((a, b) => a.rank - b.rank)) {
+    const chosen = row.method === state.method;
+    const [px, py, size] = [x(row.autonomy), y(row.success), widthOf(signed(row), `${chosen ? "bold " : ""}11.5px`)];
+    for (const [dx, dy, anchor] of PLACES) {
+      const left = px + dx - BEFORE[anchor] * size;
       const box = [left, py + dy - 11, left + size, py + dy + 3];
-      if (box[0] < PLANE.left || box[2] > width - 2 || box[1] < 8 || box[3] > y.from || taken.some((other) => overlap(box, other))) continue;
+      const outside = box[0] < PLANE.left || box[2] > width - 2 || box[1] < 8 || box[3] > y.from;
+      if (outside || taken.some((other) => overlap(box, other))) continue;
       taken.push(box);
-      layer.append(svg("text", { x: px + dx, y: py + dy, "text-anchor": anchor, class: row.method === state.method ? "chosen" : null },
-        signed(row)));
+      const place = { x: px + dx, y: py + dy, "text-anchor": anchor, class: chosen ? "chosen" : null };
+      layer.append(svg("text", place, signed(row)));
       break;
     }
   }
