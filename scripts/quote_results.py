@@ -98,6 +98,11 @@ def quoted(where: str) -> float:
     return float(found[column])
 
 
+def unsigned_zero(shown: str) -> str:
+    """`shown` without its minus where no digit is left of what it was: 0.00 and not -0.00."""
+    return shown if shown.strip("-0.") else shown.lstrip("-")
+
+
 def current(text: str) -> str:
     """`text` with every quoted number and table as it now stands in the tables."""
 
@@ -105,7 +110,7 @@ def current(text: str) -> str:
         value, digits = quoted(match["where"]), len(match["digits"] or "")
         sign = "+" if match["number"].startswith("+") else ""
         shown = "–" if pd.isna(value) else f"{value:{sign}.{digits}f}"
-        return shown.replace("-0.00", "0.00") + match["quote"]
+        return unsigned_zero(shown) + match["quote"]
 
     def rows(match: re.Match[str]) -> str:
         found = {

@@ -134,6 +134,11 @@ def test_quoted_numbers_are_those_of_the_tables(quotes: ModuleType) -> None:
     assert counted > 30
 
 
+def test_a_small_negative_number_keeps_its_sign_unless_no_digit_is_left(quotes: ModuleType) -> None:
+    shown = {"-0.00": "0.00", "-0.001": "-0.001", "-0": "0", "-10.00": "-10.00", "+0.00": "+0.00", "–": "–"}
+    assert {text: quotes.unsigned_zero(text) for text in shown} == shown
+
+
 def test_a_number_that_is_off_is_found_and_put_right(quotes: ModuleType) -> None:
     where = "<!--= leaderboard cart-pole/cart-mass-3 onset expert return_mean -->"
     assert quotes.current(f"5.01{where} and +4.9{where}") == f"5.00{where} and +5.0{where}"
