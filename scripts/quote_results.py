@@ -47,9 +47,7 @@ SIGNALS = re.compile(
     r".*?(?P<close><!--/signals-->)",
     re.DOTALL,
 )
-DISTURBANCES = re.compile(
-    r"(?P<open><!--disturbances (?P<task>\S+)-->\n).*?(?P<close><!--/disturbances-->)", re.DOTALL
-)
+DISTURBANCES = re.compile(r"(?P<open><!--disturbances (?P<task>\S+)-->\n).*?(?P<close><!--/disturbances-->)", re.DOTALL)
 KEYS = {
     "leaderboard": ("protocol", "method"),
     "paper_literal_leaderboard": ("protocol", "method"),

@@ -90,9 +90,7 @@ def test_the_band_does_not_depend_on_a_course_that_all_episodes_share() -> None:
     moved = [each.with_signal("total", each.signals["total"] + course) for each in (nominal, test)]
     plain = ConformalBand("total").calibrate(Calibration(Panel(nominal, "start"), nominal)).rule
     other = ConformalBand("total").calibrate(Calibration(Panel(moved[0], "start"), moved[0])).rule
-    np.testing.assert_array_equal(
-        Panel(test, "start").handover_of(plain), Panel(moved[1], "start").handover_of(other)
-    )
+    np.testing.assert_array_equal(Panel(test, "start").handover_of(plain), Panel(moved[1], "start").handover_of(other))
 
 
 def test_the_profile_is_that_of_the_traces_that_reach_a_step() -> None:

@@ -148,9 +148,7 @@ def _equal(left: pd.DataFrame, right: pd.DataFrame) -> np.ndarray:
     return ((left == right) | (left.isna() & right.isna())).all(axis=1).to_numpy()
 
 
-def _differences(
-    left: pd.DataFrame, right: pd.DataFrame, score: str, ends: tuple[str, str]
-) -> list[Difference | None]:
+def _differences(left: pd.DataFrame, right: pd.DataFrame, score: str, ends: tuple[str, str]) -> list[Difference | None]:
     """Per row, the two intervals where they do not overlap; a score that only one side has is a difference."""
     low_a, high_a = (left[end].to_numpy(float) for end in ends)
     low_b, high_b = (right[end].to_numpy(float) for end in ends)

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 GATE = 0.995
 """Share of undisturbed handovers that must succeed before any result of a task means anything."""
 
+
 def find_cell(task: Task, disturbance: str | None, severity: int) -> Cell:
     """The task's cell, by default its paper's; an unknown one lists the valid ones, nearest first."""
     return task.find(disturbance, severity, task.cells)

@@ -62,9 +62,7 @@ def reference_folder(task: Task) -> Path:
 def reference_signals(task: Task) -> tuple[str, ...]:
     """The task's signals that need the learner alone: neither fits to its training steps nor other learners."""
     fitted = fitted_signals(task)
-    return tuple(
-        name for name in task.signals if registry.base_signal(name) not in fitted and not needs_members(name)
-    )
+    return tuple(name for name in task.signals if registry.base_signal(name) not in fitted and not needs_members(name))
 
 
 def reference(task: Task) -> Reference:

@@ -143,9 +143,7 @@ def calibration_of(
     return Calibration(panel_of(loaded["calibrate"], nominal, protocol), nominal, seed=seed)
 
 
-def plain_rows(
-    task: Task, cell: Cell, trained: Trained, test: Panel, method: Method, rule: Any
-) -> pd.DataFrame:
+def plain_rows(task: Task, cell: Cell, trained: Trained, test: Panel, method: Method, rule: Any) -> pd.DataFrame:
     """Rules that give control back have no table: drive the same episodes."""
     driver, signals = trained.learner(task), trained.signals(task, getattr(rule, "reads", None))
     envs = {True: make_env(task, cell), False: make_env(task, task.undisturbed(cell))}

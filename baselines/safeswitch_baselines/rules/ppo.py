@@ -114,9 +114,7 @@ class PPORule(SignalMethod):
         return Calibrated(PolicyRule(names, scale, layers), float("nan"), episodes, queries)
 
 
-def _train(
-    games: HandoverVectorEnv, scale: Scale, seeds: list[int]
-) -> tuple[list[tuple[Array, Array]], int, int]:
+def _train(games: HandoverVectorEnv, scale: Scale, seeds: list[int]) -> tuple[list[tuple[Array, Array]], int, int]:
     """Layers of the trained policy, and the episodes and expert-driven steps that it took."""
     try:
         import torch

@@ -158,9 +158,7 @@ def _step(h: float, steering_only: bool, car: Car) -> ca.Function:
     s_dot = (v_x * ca.cos(psi) - v * ca.sin(psi)) / _stretch(kappa, e)
     e_dot = v_x * ca.sin(psi) + v * ca.cos(psi)
     pose = [s + h * s_dot, e_y + h * e_dot, e_psi + h * (w - kappa * s_dot)]
-    return ca.Function(
-        "rally_car_step", [symbols.x, symbols.u, symbols.p], [ca.vertcat(*pose, new_v_y, new_r, *rest)]
-    )
+    return ca.Function("rally_car_step", [symbols.x, symbols.u, symbols.p], [ca.vertcat(*pose, new_v_y, new_r, *rest)])
 
 
 def _stretch(kappa: ca.MX, e_y: ca.MX) -> ca.MX:

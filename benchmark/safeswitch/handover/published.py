@@ -20,9 +20,7 @@ from safeswitch.names import unknown
 from safeswitch.protocols import ARMINGS, Arming
 from safeswitch.suite import SPLIT_SIZE, SPLITS, Cell, Split
 
-_NAME = re.compile(
-    r"(?P<disturbance>.+)-(?P<severity>\d+)(?:-(?P<split>calibrate|test))?-learner(?P<learner>\d+)\.npz"
-)
+_NAME = re.compile(r"(?P<disturbance>.+)-(?P<severity>\d+)(?:-(?P<split>calibrate|test))?-learner(?P<learner>\d+)\.npz")
 """Files without a split are of the first format, which had test episodes only."""
 
 

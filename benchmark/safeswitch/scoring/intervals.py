@@ -27,9 +27,7 @@ SCORES = ["autonomy", *SHARES, "share_used", *MEDIANS]
 COLUMNS = [f"{name}_{end}" for name in SCORES for end in ("lo", "hi")]
 
 
-def score_intervals(
-    frame: pd.DataFrame, infos: Mapping[str, TaskInfo], resamples: int, seed: int
-) -> pd.DataFrame:
+def score_intervals(frame: pd.DataFrame, infos: Mapping[str, TaskInfo], resamples: int, seed: int) -> pd.DataFrame:
     """Lower and upper bounds of `SCORES` per leaderboard row of prepared episodes (its key is the index)."""
     scores = episode_scores(frame, infos)
     rows, index = [], []

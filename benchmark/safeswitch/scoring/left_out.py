@@ -59,9 +59,7 @@ def _whole_group(cell: tuple[Any, ...], rows: pd.DataFrame, horizon: int) -> Pai
     return max(paired_episodes(cell, rows, horizon), key=len)
 
 
-def _rows(
-    task: str, protocol: str, parts: list[PairedEpisodes], resamples: int, seed: int
-) -> list[dict[str, Any]]:
+def _rows(task: str, protocol: str, parts: list[PairedEpisodes], resamples: int, seed: int) -> list[dict[str, Any]]:
     group = _pooled((task, "left-out", 3, protocol), parts)
     weights = group.weights(resamples, seed)
     mean, means = group.mean_returns(group.once)[0], group.mean_returns(weights)

@@ -103,9 +103,7 @@ class Track:
             else:
                 slide = math.atan2(kappa * along, ahead) / kappa
                 # (1 - hypot(kappa along, ahead)) / kappa, without the cancellation
-                e_y = (2.0 * left - kappa * (along * along + left * left)) / (
-                    1.0 + math.hypot(kappa * along, ahead)
-                )
+                e_y = (2.0 * left - kappa * (along * along + left * left)) / (1.0 + math.hypot(kappa * along, ahead))
             shift = round(slide / nodes.step)
             if shift == 0:
                 break
