@@ -12,12 +12,13 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from micro import MICRO, TASK, leaderboard_bytes, micro_run
-from safeswitch import pipeline, scoring_stages, stages
+from safeswitch import execution, pipeline, scoring_stages, stages
 from safeswitch.handover.episode import NeverSwitch, run_episode
 from safeswitch.pipeline import Run
 from safeswitch.stages import CellTables, Job
@@ -66,8 +67,9 @@ def jobs_of(store: Store, task: Task = TASK, members: tuple[Key, ...] = ()) -> d
     signals = scoring_stages.signals_job(store, task, cell, trained, tables.test, tables.test_nominal)
     scores = pipeline.publish.scores_job(store, task, None, [episodes], [signals])  # type: ignore[arg-type]
     spread = pipeline.publish.spread_job(store, task, 0, tables)
-    figures = pipeline.publish.figures_job(store, task, trained, episodes, tables, scores)
-    every = (demonstrations, learner, fits, table, episodes, signals, scores, spread, figures)
+    figures = pipeline.publish.figures_job(store, task, episodes, tables, scores)
+    film = pipeline.publish.film_job(store, task, trained, episodes, tables)
+    every = (demonstrations, learner, fits, table, episodes, signals, scores, spread, figures, film)
     return {job.stage: job for job in every if job is not None}
 
 
@@ -84,18 +86,21 @@ def edited(module: str) -> type[Store]:
 @pytest.mark.parametrize(
     ("module", "run_again"),
     [
-        ("safeswitch_baselines.rules/cem.py", {"episodes", "scores", "spread", "figures"}),
-        ("safeswitch_baselines.rules/thresholds.py", {"episodes", "scores", "spread", "figures"}),
-        ("safeswitch.handover.panel", {"episodes", "scores", "spread", "figures"}),
-        ("safeswitch.scoring/metrics.py", {"scores", "figures"}),
-        ("safeswitch.scoring/video.py", {"scores", "figures"}),
-        ("safeswitch.pictures", {"figures"}),
+        ("safeswitch_baselines.rules/cem.py", {"episodes", "scores", "spread", "figures", "film"}),
+        ("safeswitch_baselines.rules/thresholds.py", {"episodes", "scores", "spread", "figures", "film"}),
+        ("safeswitch.handover.panel", {"episodes", "scores", "spread", "figures", "film"}),
+        ("safeswitch.scoring/metrics.py", {"scores", "figures", "film"}),
+        ("safeswitch.scoring/video.py", {"scores", "figures", "film"}),
+        ("safeswitch.pictures", {"figures", "film"}),
         ("safeswitch.scoring.signal_quality", {"signals", "scores", "figures"}),
-        ("safeswitch.handover.episode", {"table", "episodes", "signals", "scores", "spread", "figures"}),
-        ("safeswitch_baselines.signals/smoothing.py", {"table", "episodes", "signals", "scores", "spread", "figures"}),
+        ("safeswitch.handover.episode", {"table", "episodes", "signals", "scores", "spread", "figures", "film"}),
+        (
+            "safeswitch_baselines.signals/smoothing.py",
+            {"table", "episodes", "signals", "scores", "spread", "figures", "film"},
+        ),
         (
             "safeswitch_baselines.learners/networks.py",
-            {"learner", "table", "episodes", "signals", "scores", "spread", "figures"},
+            {"learner", "table", "episodes", "signals", "scores", "spread", "figures", "film"},
         ),
         ("safeswitch.demos", None),
         ("safeswitch.tasks.simulator", None),
@@ -208,7 +213,7 @@ def test_a_second_run_computes_nothing(finished: tuple[Path, bytes], monkeypatch
     def refuse(root: str, job: Job) -> str:
         raise AssertionError(f"{job.stage} {job.label} was run again")
 
-    monkeypatch.setattr(pipeline, "run_job", refuse)
+    monkeypatch.setattr(execution, "run_job", refuse)
     again = micro_run(root)
     assert leaderboard_bytes(again) == table
     assert all(again.store.has(job.key) for job in [*again.episodes, *again.signals, *again.learners])
@@ -253,6 +258,7 @@ def files_of(store: Store, key: str) -> dict[str, bytes]:
 INTERRUPTED = """
 import sys
 from pathlib import Path
+from typing import Any
 from micro import leaderboard_bytes, micro_run
 if __name__ == "__main__":
     leaderboard_bytes(micro_run(Path(sys.argv[1]), workers=2))
@@ -282,6 +288,42 @@ def test_after_a_kill_in_the_middle_a_rerun_ends_with_the_same_bytes(
     run = micro_run(root)
     assert leaderboard_bytes(run) == table
     assert not list((root / ".writing").glob("*")), "what the killed processes left is removed"
+
+
+def note(folder: Path, text: str) -> None:
+    (folder / "note.txt").write_text(text)
+
+
+def test_a_stage_of_several_tasks_is_one_queue_and_is_shown_once(tmp_path: Path, capsys: Any) -> None:
+    store = Store(tmp_path)
+    runs = [Run(replace(TASK, name=name), MICRO, store, workers=2) for name in ("first", "second")]
+    jobs = {
+        run: [
+            Job(
+                "note",
+                f"{run.task.name} {index}",
+                store.key("note", {"run": run.task.name, "n": index}, [], []),
+                note,
+                (str(index),),
+            )
+            for index in range(count)
+        ]
+        for run, count in zip(runs, (3, 1), strict=True)
+    }
+    execution.finish("training", jobs)
+    assert capsys.readouterr().err.startswith("first, second training: 4 to do ... done in")
+    assert [(run.jobs["training"], run.seconds["training"] > 0) for run in runs] == [(3, True), (1, True)]
+    assert runs[0].work["training"] == sum(store.recipe(job.key)["seconds"] for job in jobs[runs[0]])
+    assert {(store.folder(job.key) / "note.txt").read_text() for each in jobs.values() for job in each} == {
+        "0",
+        "1",
+        "2",
+    }
+    runs[0].finish("training", jobs[runs[0]])
+    execution.finish("training", jobs)
+    assert capsys.readouterr().err == "", "nothing is left to do, and it was shown before"
+    Run(TASK, MICRO, store).finish("training", jobs[runs[1]])
+    assert "training: kept from before" in capsys.readouterr().err
 
 
 def test_a_run_computes_stages_only_when_they_are_asked_for(tmp_path: Path) -> None:

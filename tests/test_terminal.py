@@ -19,7 +19,7 @@ import pytest
 from rich.console import Console
 
 from micro import MICRO, TASK
-from safeswitch import cli, console, durations, pipeline, suite
+from safeswitch import cli, console, durations, execution, suite
 from safeswitch.console import Progress, StageError
 from safeswitch.files import load_json
 from safeswitch.interrupts import for_this_process_alone
@@ -184,11 +184,26 @@ def test_a_guess_comes_from_the_last_run_in_the_folder_if_it_was_alike(tmp_path:
     (tmp_path / "manifest.json").write_text(json.dumps({"cart-pole": entry}))
     found = durations.stages("cart-pole", "standard", tmp_path)
     assert durations.total(found, workers=2) == 45.0
-    assert durations.of_stage(found, "training", pending=3, workers=2) == 60.0, "two rounds of 30 s"
-    assert durations.of_stage(found, "training", pending=1, workers=2) == 30.0
-    assert durations.of_stage(found, "figures", pending=1, workers=2) is None
+    assert durations.of_stage([(found, 3)], "training", workers=2) == 60.0, "two rounds of 30 s"
+    assert durations.of_stage([(found, 1)], "training", workers=2) == 30.0
+    assert durations.of_stage([(found, 1)], "figures", workers=2) is None
+    longer = {"training": durations.Stage(work=200.0, jobs=1)}
+    assert durations.of_stage([(found, 1), (longer, 1)], "training", workers=2) == 200.0, "side by side"
+    assert durations.of_stage([(found, 6), (longer, 1)], "training", workers=2) == 190.0 + 10.0, (
+        "no less than the longest"
+    )
+    assert durations.of_stage([(found, 1), ({}, 1)], "training", workers=2) is None
     assert set(durations.stages("cart-pole", "smoke", tmp_path)) > {"training"}, "another profile: the shipped ones"
     assert durations.total(durations.stages("cart-pole", "nothing", tmp_path), 2) is None
+
+
+def test_tasks_that_are_trained_side_by_side_take_less_time_together() -> None:
+    one = {"training": durations.Stage(20.0, 1), "figures": durations.Stage(10.0, 1)}
+    other = {"training": durations.Stage(200.0, 1), "switch rules": durations.Stage(60.0, 3)}
+    assert durations.together([one, other], workers=2) == 200.0 + 10.0 + 30.0
+    assert durations.together([one, other], workers=1) == 220.0 + 10.0 + 60.0
+    assert durations.together([one], workers=2) == durations.total(one, 2)
+    assert durations.together([one, {}], workers=2) == durations.total(one, 2)
 
 
 def test_the_announcement_says_how_long_and_where(tmp_path: Path) -> None:
@@ -241,7 +256,7 @@ def test_a_stage_that_breaks_is_exit_code_1_with_the_place(
     def broken(root: str, job: Any) -> str:
         raise ZeroDivisionError("in somebody's learner")
 
-    monkeypatch.setattr(pipeline, "run_job", broken)
+    monkeypatch.setattr(execution, "run_job", broken)
     monkeypatch.setitem(suite.PROFILES, "micro", MICRO)
     options = ["--profile", "micro", "--task", "cart-pole", "--jobs", "1", "--store", str(tmp_path)]
     assert cli.main(["train", *options]) == 1
@@ -254,11 +269,11 @@ def test_a_setting_that_a_stage_refuses_is_bad_input(tmp_path: Path, monkeypatch
     def refuse(root: str, job: Any) -> str:
         raise ValueError("no such learner option")
 
-    monkeypatch.setattr(pipeline, "run_job", refuse)
+    monkeypatch.setattr(execution, "run_job", refuse)
     run = Run(TASK, MICRO, Store(tmp_path), workers=1)
     with pytest.raises(ValueError, match="no such learner option"):
         _ = run.demonstrations
-    monkeypatch.setattr(pipeline, "run_job", lambda root, job: 1 / 0)
+    monkeypatch.setattr(execution, "run_job", lambda root, job: 1 / 0)
     with pytest.raises(StageError):
         _ = Run(TASK, MICRO, Store(tmp_path), workers=1).demonstrations
 

@@ -38,6 +38,7 @@ class Bench:
     def run(self) -> None:
         """Do it."""
         from safeswitch import board
+        from safeswitch.pipeline import prepare
         from safeswitch.publish import default_folder, publish
         from safeswitch.report import write_report
         from safeswitch.summary import announcement, summary
@@ -47,6 +48,9 @@ class Bench:
         started, runs = time.perf_counter(), self.common.runs()
         folder = (self.results or default_folder(self.common.profile)).absolute()
         log.print("\n".join(announcement(runs, folder)), markup=False)
+        for run in runs:
+            run.plan_for(folder)
+        prepare(runs)
         for run in runs:
             publish(run, folder)
             if self.tensorboard:
@@ -103,10 +107,12 @@ class Train:
     def run(self) -> None:
         """Do it."""
         from safeswitch import board
+        from safeswitch.pipeline import train
 
         if self.tensorboard:
             board.check_installed()
         runs = self.common.runs()
+        train(runs)
         folders = {job.label: run.store.folder(job.key) for run in runs for job in run.learners}
         if self.tensorboard:
             for run in runs:

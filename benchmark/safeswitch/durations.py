@@ -7,6 +7,7 @@ totals. Nothing but what is shown depends on them.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,9 +42,37 @@ def total(found: dict[str, Stage], workers: int) -> float | None:
     return seconds or None
 
 
-def of_stage(found: dict[str, Stage], name: str, pending: int, workers: int) -> float | None:
-    """Wall time of `pending` jobs of a stage [s]; None if it is not known how long one takes."""
-    stage = found.get(name)
-    if stage is None or not stage.jobs or not pending:
+SIDE_BY_SIDE = ("training", "signal fits")
+"""Stages that a run of several tasks goes through for all of them at once (`safeswitch.pipeline.prepare`)."""
+
+
+def together(each: Sequence[dict[str, Stage]], workers: int) -> float:
+    """Wall time of several tasks in one run, from scratch [s]; those of which nothing is known count as nothing."""
+    seconds = sum(total(found, workers) or 0.0 for found in each)
+    for name in SIDE_BY_SIDE:
+        parts = [(found, found[name].jobs or 1) for found in each if name in found]
+        apart = sum(of_stage([part], name, workers) or 0.0 for part in parts)
+        seconds += min((of_stage(parts, name, workers) or apart) - apart, 0.0)
+    return seconds
+
+
+def of_stage(parts: Sequence[tuple[dict[str, Stage], int]], name: str, workers: int) -> float | None:
+    """Wall time of the pending jobs of a stage [s], of one task or of several at once; None if one's is not known.
+
+    Args:
+        parts: stages of an earlier run of a task, and how many jobs of it are pending now.
+        name: the stage.
+        workers: processes at a time.
+    """
+    each = []
+    for found, pending in parts:
+        if pending:
+            stage = found.get(name)
+            if stage is None or not stage.jobs:
+                return None
+            each += [stage.work / stage.jobs] * pending
+    if not each:
         return None
-    return stage.work / stage.jobs * -(-pending // min(workers, pending))
+    if len(set(each)) == 1:
+        return each[0] * -(-len(each) // min(workers, len(each)))
+    return max(max(each), sum(each) / workers)

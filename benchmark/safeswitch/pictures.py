@@ -51,10 +51,14 @@ SHEET_STEPS = (-1, 0, 8, 16, 24)
 """Steps of the sheet, from the onset on."""
 
 
-def draw(folder: Path, root: str, task: Task, trained: Trained, episodes: str, tables: CellTables, scores: str) -> None:
-    """Draw everything into `folder`/figures, for the first learner in the paper's cell."""
+PART = "figures"
+"""Folder in which each of the two jobs leaves its files; together they are a task's folder of figures."""
+
+
+def draw(folder: Path, root: str, task: Task, episodes: str, tables: CellTables, scores: str) -> None:
+    """Draw the figures that need no driving learner into `folder`/figures: first learner, paper's cell."""
     store, cell = Store(Path(root)), task.paper_cell
-    target = folder / "figures"
+    target = folder / PART
     target.mkdir(parents=True)
     loaded = tables.load(store, task, cell)
     rows = _own(load_frame(store.folder(episodes) / "episodes.npz"))
@@ -68,11 +72,20 @@ def draw(folder: Path, root: str, task: Task, trained: Trained, episodes: str, t
         place = (cell.disturbance, cell.severity)
         figures.figure_plane(table, task.name, place, protocol, target / f"plane-{protocol}.png")
     _draw_signals(read_csv(store.folder(scores) / "signals.csv"), task, target)
+    _draw_disturbances(task, target)
+
+
+def film(folder: Path, root: str, task: Task, trained: Trained, episodes: str, tables: CellTables) -> None:
+    """Drive an episode of the paper's cell under several drivers; its figure and films go into `folder`/figures."""
+    store, cell = Store(Path(root)), task.paper_cell
+    target = folder / PART
+    target.mkdir(parents=True)
+    loaded = tables.load(store, task, cell)
+    rows = _own(load_frame(store.folder(episodes) / "episodes.npz"))
     calibration = scoring_stages.calibration_of(loaded, task, cell, "onset", seed=0)
     story = _drive_story(task, trained, loaded["test"], calibration, rows)
     _draw_episode(story, rows, target)
     _draw_film(story, target)
-    _draw_disturbances(task, target)
 
 
 def _own(rows: pd.DataFrame) -> pd.DataFrame:

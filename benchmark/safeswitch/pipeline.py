@@ -7,17 +7,14 @@ it depends on, so that a second run computes nothing and an interrupted one cont
 
 from __future__ import annotations
 
-import time
-import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import product
-
-from joblib import Parallel, delayed, parallel_config
+from pathlib import Path
 
 from safeswitch import durations, factories, publish
-from safeswitch.console import Progress, StageError
+from safeswitch.execution import finish
 from safeswitch.scoring.metrics import TaskInfo
 from safeswitch.scoring_stages import episodes_job, methods_in, signals_job
 from safeswitch.sensitivity import SAMPLES, latency_job, samples_job, varied_job
@@ -56,7 +53,7 @@ PAPER = ("epistemic", "aleatoric", "total")
 """The signals of the paper."""
 
 
-@dataclass
+@dataclass(eq=False)
 class Run:
     """One task under one profile: each property is a stage, computed when it is first asked for.
 
@@ -99,23 +96,31 @@ class Run:
     @cached_property
     def learners(self) -> list[Job]:
         """One trained learner per learner seed."""
+        self.finish("training", self.learner_jobs)
+        return self.learner_jobs
+
+    @cached_property
+    def learner_jobs(self) -> list[Job]:
+        """The same, not trained yet."""
         demonstrations = self.demonstrations if factories.wants_demonstrations(self.task.learner) else None
-        jobs = [
+        return [
             learner_job(self.store, self.task, self.profile, seed, demonstrations)
             for seed in range(self.profile.learners)
         ]
-        self.finish("training", jobs)
-        return jobs
+
+    @cached_property
+    def fit_jobs(self) -> list[Job]:
+        """What is fitted to the training steps of each learner, for signals; not fitted yet."""
+        return [
+            fits_job(self.store, self.task, seed, learner, self.demonstrations)
+            for seed, learner in enumerate(self.learner_jobs)
+            if fitted_signals(self.task)
+        ]
 
     @cached_property
     def trained(self) -> list[Trained]:
         """Each learner with what its signals need: fits to its training steps, and the learners of the other seeds."""
-        keys = [job.key for job in self.learners]
-        fits = [
-            fits_job(self.store, self.task, seed, learner, self.demonstrations)
-            for seed, learner in enumerate(self.learners)
-            if fitted_signals(self.task)
-        ]
+        keys, fits = [job.key for job in self.learners], self.fit_jobs
         if fits:
             self.finish("signal fits", fits)
         members = any(needs_members(signal) for signal in self.task.signals)
@@ -281,14 +286,17 @@ class Run:
         return jobs
 
     @cached_property
-    def figures(self) -> Job:
-        """Figures and video of the first learner in the paper's cell."""
+    def figures(self) -> list[Job]:
+        """Figures and film of the first learner in the paper's cell."""
         cell = str(self.task.paper_cell)
         episodes = next(job for job in self.episodes if job.label == f"{cell} learner 0")
         tables = self.tables[0, cell]
-        job = publish.figures_job(self.store, self.task, self.trained[0], episodes, tables, self.scores)
-        self.finish("figures", [job])
-        return job
+        jobs = [
+            publish.film_job(self.store, self.task, self.trained[0], episodes, tables),
+            publish.figures_job(self.store, self.task, episodes, tables, self.scores),
+        ]
+        self.finish("figures", jobs)
+        return jobs
 
     @cached_property
     def literal(self) -> Run | None:
@@ -320,41 +328,34 @@ class Run:
         }
         return tuple(stage for stage in STAGES if not left_out.get(stage))
 
+    def plan_for(self, folder: Path) -> None:
+        """Number the stages that `publish` goes through, and look up in `folder` what they took before."""
+        self.plan, self.typical = self.stages, durations.stages(self.task.name, self.profile.name, folder)
+
     def finish(self, stage: str, jobs: Iterable[Job]) -> None:
         """Run the jobs that the store does not hold yet, `workers` at a time, with a progress bar."""
-        jobs = list({job.key: job for job in jobs}.values())
-        started = time.perf_counter()
-        pending = [job for job in jobs if not self.store.has(job.key)]
-        expected = durations.of_stage(self.typical, stage, len(pending), self.workers)
-        with Progress(self._label(stage), len(jobs), len(jobs) - len(pending), expected) as progress:
-            try:
-                for label in self._run(pending):
-                    progress.advance(label)
-            except ValueError:
-                raise  # a setting that is refused
-            except Exception as error:
-                raise StageError(f"{self.task.name}: {stage} failed: {type(error).__name__}: {error}") from error
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - started
-        for job in jobs:
-            self._spent.setdefault(stage, {})[job.key] = self.store.recipe(job.key)["seconds"]
-        self.work[stage], self.jobs[stage] = sum(self._spent[stage].values()), len(self._spent[stage])
+        finish(stage, {self: list({job.key: job for job in jobs}.values())})
 
-    def _run(self, pending: list[Job]) -> Iterator[str]:
-        """Labels of the jobs, each as soon as it is finished."""
-        with parallel_config("loky", n_jobs=min(self.workers, max(len(pending), 1)), inner_max_num_threads=1):
-            with warnings.catch_warnings():  # loky replaces a worker whose memory has grown, and warns of it
-                warnings.filterwarnings("ignore", message="A worker stopped while some jobs", category=UserWarning)
-                yield from Parallel(return_as="generator_unordered")(
-                    delayed(run_job)(str(self.store.root), job) for job in pending
-                )
-
-    def _label(self, stage: str) -> str:
-        number = f"{self.plan.index(stage) + 1}/{len(self.plan)} " if stage in self.plan else ""
-        return f"{self.title or self.task.name} {number}{stage:<{max(map(len, STAGES)) if number else 0}}"
+    def record(self, stage: str, jobs: Sequence[Job], seconds: float) -> None:
+        """Add the wall time and the jobs of a stage to what this run knows of it."""
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
+        spent = self._spent.setdefault(stage, {})
+        spent.update({job.key: self.store.recipe(job.key)["seconds"] for job in jobs})
+        self.work[stage], self.jobs[stage] = sum(spent.values()), len(spent)
 
 
-def run_job(root: str, job: Job) -> str:
-    """Run one job in this process and move its results into the store."""
-    with Store(root).writing(job.key) as folder:
-        job.run(folder, *job.arguments)
-    return job.label
+def train(runs: Sequence[Run]) -> None:
+    """Demonstrations and learners of several tasks.
+
+    Training one learner keeps one core busy: those of different tasks are trained side by side.
+    """
+    for run in runs:
+        if factories.wants_demonstrations(run.task.learner):
+            _ = run.demonstrations
+    finish("training", {run: run.learner_jobs for run in runs})
+
+
+def prepare(runs: Sequence[Run]) -> None:
+    """Learners of several tasks and what their signals are fitted to, before any of them is tested."""
+    train(runs)
+    finish("signal fits", {run: run.fit_jobs for run in runs})

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 from rich.markup import escape
 
-from safeswitch import durations, pictures, registry
+from safeswitch import pictures, registry
 from safeswitch.console import log
 from safeswitch.files import load_frame, load_json, save_frame, save_json
 from safeswitch.handover.published import file_name, write_table
@@ -46,6 +46,8 @@ if TYPE_CHECKING:
     from safeswitch.stages import CellTables
     from safeswitch.trained import Trained
 
+DRAWING = ["safeswitch.pictures", "safeswitch.scoring"]
+"""Code that figures and films depend on."""
 TABLES = ("leaderboard", "left_out", "signals", "comparisons", "failures")
 LETTERS = {"failures": "F", "rollouts": "R", "expert-queries": "Q", "privileged": "P"}
 """What a method needs, as it stands in leaderboard.md."""
@@ -61,7 +63,7 @@ def publish(run: Run, folder: Path | None = None) -> Path:
     folder = (folder or default_folder(run.profile.name)).absolute()
     started = time.time()
     commit = git_commit()  # before anything is written into the checkout
-    run.plan, run.typical = run.stages, durations.stages(run.task.name, run.profile.name, folder)
+    run.plan_for(folder)
     for reason in without_extra().values():
         log.print(f"[yellow]{escape(reason)}[/]")
     scores, spread, varied, figures = run.scores, run.spread, run.varied, run.figures
@@ -80,7 +82,7 @@ def publish(run: Run, folder: Path | None = None) -> Path:
         for name in ("leaderboard", "signals"):
             table = read_csv(run.store.folder(run.literal.scores.key) / f"{name}.csv")
             _merge(folder / f"paper_literal_{name}.csv", table)
-    _replace(run.store.folder(figures.key) / "figures", folder / "figures" / run.task.name)
+    _replace([run.store.folder(job.key) / pictures.PART for job in figures], folder / "figures" / run.task.name)
     _write_tables(run, folder / "tables" / run.task.name)
     manifest = _manifest(run, folder, commit, time.time() - started)
     save_json(folder / "manifest.json", manifest)
@@ -171,12 +173,18 @@ def _spread_row(cell: Cell, protocol: str, method: str, learner: int, seed: int,
     }
 
 
-def figures_job(store: Store, task: Task, trained: Trained, episodes: Job, tables: CellTables, scores: Job) -> Job:
-    """Figures and video of the first learner in the paper's cell."""
-    keys = [*trained.keys, episodes.key, scores.key]
-    code = ["safeswitch.pictures", "safeswitch.scoring"]
-    arguments = (str(store.root), task, trained, episodes.key, tables, scores.key)
-    return Job("figures", task.name, store.key("figures", {"task": task.name}, keys, code), pictures.draw, arguments)
+def figures_job(store: Store, task: Task, episodes: Job, tables: CellTables, scores: Job) -> Job:
+    """Figures of the first learner in the paper's cell."""
+    key = store.key("figures", {"task": task.name}, [episodes.key, scores.key], DRAWING)
+    return Job(
+        "figures", f"{task.name} figures", key, pictures.draw, (str(store.root), task, episodes.key, tables, scores.key)
+    )
+
+
+def film_job(store: Store, task: Task, trained: Trained, episodes: Job, tables: CellTables) -> Job:
+    """Film of one of its episodes there, under several drivers."""
+    key = store.key("film", {"task": task.name}, [*trained.keys, episodes.key], DRAWING)
+    return Job("film", f"{task.name} film", key, pictures.film, (str(store.root), task, trained, episodes.key, tables))
 
 
 def _write_tables(run: Run, folder: Path) -> None:
@@ -226,9 +234,11 @@ def _merge(target: Path, rows: pd.DataFrame) -> None:
     write_csv(merge_task_rows(target if target.exists() else None, rows), target)
 
 
-def _replace(source: Path, target: Path) -> None:
+def _replace(sources: list[Path], target: Path) -> None:
+    """Make `target` hold the files of `sources`, and nothing else."""
     shutil.rmtree(target, ignore_errors=True)
-    shutil.copytree(source, target)
+    for source in sources:
+        shutil.copytree(source, target, dirs_exist_ok=True)
 
 
 def _manifest(run: Run, folder: Path, commit: str, seconds: float) -> dict[str, Any]:

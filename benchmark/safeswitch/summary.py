@@ -49,7 +49,11 @@ def announcement(runs: Sequence[Run], folder: Path) -> list[str]:
     times = {task: durations.total(found, first.workers) for task, found in each.items()}
     known = {task: seconds for task, seconds in times.items() if seconds}
     parts = [f"{task} {duration(seconds)}" for task, seconds in known.items()]
-    guess = f"roughly {duration(sum(known.values()))} from scratch" if known else "unknown, nothing like it was run yet"
+    guess = (
+        f"roughly {duration(durations.together([*each.values()], first.workers))} from scratch"
+        if known
+        else "unknown, nothing like it was run yet"
+    )
     if len(parts) > 1:
         guess += f" ({', '.join(parts)})"
     if known and len(known) < len(times):
