@@ -20,7 +20,7 @@ from safeswitch.scoring import episode_figures, figures
 from safeswitch.scoring.leaderboard import read_csv
 from safeswitch.scoring.metrics import OTHERS
 from safeswitch.scoring.style import Marks
-from safeswitch.scoring.video import HEIGHT, Trace, observations, replay_frames, sees_images, write_side_by_side
+from safeswitch.scoring.video import HEIGHT, Trace, observations, replay, replay_frames, sees_images, write_side_by_side
 from safeswitch.store import Store
 from safeswitch.suite import episode_seeds
 from safeswitch.tasks.disturbances import DISTURBANCES
@@ -262,15 +262,16 @@ def _draw_film(story: Story, target: Path) -> None:
     env = _film_env(story.task)
     values = [*(run.signals[SIGNAL] for run in story.runs.values()), np.array(list(story.thresholds.values()))]
     limits = (min(float(np.nanmin(each)) for each in values), max(float(np.nanmax(each)) for each in values))
+    seen = {name: replay(env, run) for name, run in story.runs.items()}
     tiles = []
     for name, run in story.runs.items():
         threshold = story.thresholds.get(name)
         trace = Trace(SIGNAL, run.signals[SIGNAL], run.driver, env.control_dt, story.marks(name), threshold, limits)
-        tiles.append(replay_frames(env, run, name, trace))
+        tiles.append(replay_frames(env, run, name, trace, seen[name]))
     fps = round(1 / env.control_dt)
     write_side_by_side(tiles, target / "episode.mp4", fps, columns=2)
     for name, run in story.runs.items():
-        write_side_by_side([replay_frames(env, run, name)], target / _film_name(name), fps)
+        write_side_by_side([replay_frames(env, run, name, pictures=seen[name])], target / _film_name(name), fps)
     save_json(target / STORY, _story_facts(story, fps))
     env.close()
 

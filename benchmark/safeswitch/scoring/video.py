@@ -142,18 +142,16 @@ def observations(env: TaskEnv, episode: Episode, steps: Iterable[int]) -> dict[i
     return seen
 
 
-def replay_frames(env: TaskEnv, episode: Episode, caption: str, trace: Trace | None = None) -> list[Picture]:
-    """A tile for every executed step of a recorded episode.
+def replay(env: TaskEnv, episode: Episode) -> list[list[Picture]]:
+    """Pictures of every executed step of a recorded episode: the scene and, where it is one, what the learner sees.
 
     Args:
         env: the unwrapped environment of the episode's cell, with ``render_mode="rgb_array"``.
         episode: recorded with snapshots.
-        caption: written above the pictures.
-        trace: of a signal in this episode, drawn beside them.
     """
     snapshots = _snapshots(episode)
     env.reset(seed=episode.seed)
-    frames = []
+    pictures = []
     for step in range(episode.length):
         env.restore(snapshots[step])
         scene = env.render()
@@ -163,8 +161,29 @@ def replay_frames(env: TaskEnv, episode: Episode, caption: str, trace: Trace | N
             parts[0] = _overlay(parts[0], "success" if episode.success else "failure", episode.success)
         if sees_images(env):
             parts.append(_scaled(env.observe(), Image.Resampling.NEAREST))
-        if trace is not None:
-            parts.append(trace.picture(step))
+        pictures.append(parts)
+    return pictures
+
+
+def replay_frames(
+    env: TaskEnv,
+    episode: Episode,
+    caption: str,
+    trace: Trace | None = None,
+    pictures: list[list[Picture]] | None = None,
+) -> list[Picture]:
+    """A tile for every executed step of a recorded episode.
+
+    Args:
+        env: as in `replay`.
+        episode: as in `replay`.
+        caption: written above the pictures.
+        trace: of a signal in this episode, drawn beside them.
+        pictures: what `replay` gave, which takes most of the time; asked for here where they are left out.
+    """
+    frames = []
+    for step, seen in enumerate(replay(env, episode) if pictures is None else pictures):
+        parts = seen if trace is None else [*seen, trace.picture(step)]
         captions = [caption, "what the learner sees"] if len(parts) == 3 else [caption]
         frames.append(_tile(parts, captions, _remark(episode, step), Driver(int(episode.driver[step]))))
     return frames
