@@ -6,9 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from joblib import Parallel, delayed, parallel_config
+from joblib import Parallel, delayed
 
 from safeswitch import registry, scoring_stages, stages, suite
+from safeswitch.console import Progress
+from safeswitch.execution import processes
 from safeswitch.handover.episode import Episode, NeverSwitch, continue_with_expert, run_episode
 from safeswitch.names import unknown
 from safeswitch.protocols import ARMINGS, Arming
@@ -91,15 +93,20 @@ def gate(run: Run, episodes: int = 200, every: int = 5, split: suite.Split = "de
     learner = str(run.store.folder(run.learners[0].key))
     chunks = [seeds[start : start + 10] for start in range(0, len(seeds), 10)]
     task, none, paper = run.task, run.task.none_cell, run.task.paper_cell
-    with parallel_config("loky", n_jobs=run.workers, inner_max_num_threads=1):
-        alone = Parallel()(delayed(_expert_alone)(task, none, chunk) for chunk in chunks)
-        disturbed = Parallel()(delayed(_expert_alone)(task, paper, chunk) for chunk in chunks)
-        handed = Parallel()(delayed(_handed_over)(task, none, learner, chunk, every) for chunk in chunks)
-    return [
-        _gate_row(f"handover at every {every}th step, {none}", handed),
-        _gate_row(f"expert alone, {none}", alone),
-        _gate_row(f"expert alone, {paper}", disturbed),
-    ]
+    checks = {
+        f"handover at every {every}th step, {none}": [
+            delayed(_handed_over)(task, none, learner, chunk, every) for chunk in chunks
+        ],
+        f"expert alone, {none}": [delayed(_expert_alone)(task, none, chunk) for chunk in chunks],
+        f"expert alone, {paper}": [delayed(_expert_alone)(task, paper, chunk) for chunk in chunks],
+    }
+    outcomes: list[list[bool]] = []
+    with Progress(f"{task.name} gate", len(checks) * len(chunks)) as progress, processes(run.workers):
+        for found in Parallel(return_as="generator")(job for jobs in checks.values() for job in jobs):
+            outcomes.append(found)
+            progress.advance()
+    parts = (outcomes[start : start + len(chunks)] for start in range(0, len(outcomes), len(chunks)))
+    return [_gate_row(check, part) for check, part in zip(checks, parts, strict=True)]
 
 
 def _expert_alone(task: Task, cell: Cell, seeds: list[int]) -> list[bool]:

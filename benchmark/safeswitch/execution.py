@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from joblib import Parallel, delayed, parallel_config
@@ -49,12 +50,19 @@ def finish(stage: str, jobs: Mapping[Run, Sequence[Job]]) -> None:
 
 def _run(run: Run, pending: list[Job]) -> Iterator[str]:
     """Labels of the jobs, each as soon as it is finished."""
-    with parallel_config("loky", n_jobs=min(run.workers, max(len(pending), 1)), inner_max_num_threads=1):
-        with warnings.catch_warnings():  # loky replaces a worker whose memory has grown, and warns of it
-            warnings.filterwarnings("ignore", message="A worker stopped while some jobs", category=UserWarning)
-            yield from Parallel(return_as="generator_unordered")(
-                delayed(run_job)(str(run.store.root), job) for job in pending
-            )
+    with processes(min(run.workers, max(len(pending), 1))):
+        yield from Parallel(return_as="generator_unordered")(
+            delayed(run_job)(str(run.store.root), job) for job in pending
+        )
+
+
+@contextmanager
+def processes(count: int) -> Iterator[None]:
+    """Let joblib use `count` processes of one thread each in this block."""
+    with parallel_config("loky", n_jobs=count, inner_max_num_threads=1), warnings.catch_warnings():
+        # loky replaces a worker whose memory has grown, and warns of it
+        warnings.filterwarnings("ignore", message="A worker stopped while some jobs", category=UserWarning)
+        yield
 
 
 def _label(runs: Sequence[Run], stage: str) -> str:

@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from joblib import Parallel, cpu_count, delayed, parallel_config
+from joblib import Parallel, cpu_count, delayed
 
 from safeswitch import registry
 from safeswitch.console import Progress
+from safeswitch.execution import processes
 from safeswitch.files import load_json, save_json
 from safeswitch.handover.published import PublishedTables, file_name, write_table
 from safeswitch.handover.served import SPLITS
@@ -118,7 +119,7 @@ def record(
     if pending:
         with (
             Progress(label, len(recorded), len(recorded) - len(pending)) as progress,
-            parallel_config("loky", n_jobs=min(cpu_count(), len(pending)), inner_max_num_threads=1),
+            processes(min(cpu_count(), len(pending))),
         ):
             run = Parallel(return_as="generator_unordered")(delayed(_run)(str(store.root), pair) for pair in pending)
             for name in run:

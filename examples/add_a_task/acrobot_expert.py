@@ -30,9 +30,9 @@ PARAMETERS = (
     "torque_limit",  # [N m] per unit of action
 )
 GRAVITY = 9.81  # [m/s^2]
-WEIGHT_ANGLE, WEIGHT_SPEED, WEIGHT_ACTION = (5.0, 5.0), (0.05, 0.05), 2.0
+WEIGHT_ANGLE, WEIGHT_SPEED, WEIGHT_ACTION = (5.0, 5.0), (0.4, 0.4), 2.0
 WEIGHT_TERMINAL = 10.0
-HORIZON = 50
+HORIZON = 40
 SWINGS = (2.0, 3.0, 4.0, 5.5)
 """Frequencies of the first guesses of a cold start [rad/s]; each is tried to both sides."""
 

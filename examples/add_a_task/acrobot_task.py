@@ -179,11 +179,11 @@ TASK = Task(
     name="acrobot",
     env_id=f"acrobot_task:{ENV_ID}",  # the module in front: worker processes import it
     learner="bayesian-mlp",
-    learner_options={"angles": (0, 1), "epochs": 100, "dropout": 0.02},
+    learner_options={"angles": (0, 1), "epochs": 100, "dropout": (0.0, 0.0, 0.1)},
     dataset="acrobot/expert-v0",
     demonstrations={
         "episodes": 300,
-        "noise": {"low": 0.01, "high": 0.04, "correlated_fraction": 0.5, "correlation": 0.7},
+        "noise": {"low": 0.02, "high": 0.1, "correlated_fraction": 0.5, "correlation": 0.7},
     },
     signals=("epistemic", "aleatoric", "total", "total-mean3"),
     cells=(
