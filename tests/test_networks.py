@@ -120,6 +120,8 @@ def test_config_survives_json():
         ({"loss": "beta_nll"}, r"'beta_nll'.*nearest first: beta-nll"),
         ({"dropout": 1.0}, r"dropout=1.0.*\[0, 1\)"),
         ({"dropout": (0.1, 0.2)}, r"one rate or 3 of them"),
+        ({"last_dropout": 1.0}, r"last_dropout=1.0.*\[0, 1\)"),
+        ({"last_dropout": (0.1, 0.2)}, r"last_dropout=.*one rate or 1 of them"),
         ({"hidden": ()}, "hidden"),
         ({"angles": (1, 1)}, "without repetition"),
         ({"samples": 0}, "samples=0"),
@@ -130,6 +132,14 @@ def test_config_survives_json():
 def test_wrong_settings_name_value_and_what_is_allowed(values, message):
     with pytest.raises(ValueError, match=message):
         MLPConfig.from_json(values)
+
+
+@pytest.mark.parametrize("hidden", [(8,), (8, 4), (8, 4, 4)])
+def test_last_dropout_is_that_of_the_last_hidden_layer_whatever_their_number(hidden):
+    plain, last = MLPConfig(hidden=hidden, dropout=0.2), MLPConfig(hidden=hidden, dropout=0.2, last_dropout=0.0)
+    assert plain.rates == (0.2,) * len(hidden)
+    assert last.rates == (*plain.rates[:-1], 0.0)
+    assert MLPConfig.from_json(json.loads(json.dumps(last.to_json()))) == last
 
 
 def test_angle_out_of_range_is_refused():

@@ -179,7 +179,7 @@ TASK = Task(
     name="acrobot",
     env_id=f"acrobot_task:{ENV_ID}",  # the module in front: worker processes import it
     learner="bayesian-mlp",
-    learner_options={"angles": (0, 1), "epochs": 100, "dropout": (0.0, 0.0, 0.1)},
+    learner_options={"angles": (0, 1), "epochs": 100, "dropout": 0.0, "last_dropout": 0.1},
     dataset="acrobot/expert-v0",
     demonstrations={
         "episodes": 300,

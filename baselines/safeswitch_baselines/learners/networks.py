@@ -28,16 +28,20 @@ class MLPConfig(TrainingConfig):
     Attributes:
         hidden: width of each hidden layer.
         dropout: chance to drop a unit, after every hidden layer, or one value per hidden layer (0: no dropout there).
+        last_dropout: the same after the last hidden layer, whatever `dropout` says; None for no exception. Dropout
+            there alone leaves the expected mean as it is, since the output is linear in that layer.
         angles: indices of observation components in [rad] that the network sees as (sin, cos).
     """
 
     hidden: tuple[int, ...] = (256, 256, 256)
     dropout: float | tuple[float, ...] = 0.1
+    last_dropout: float | None = None
     angles: tuple[int, ...] = ()
 
     def _check(self) -> None:
         require(len(self.hidden) > 0 and min(self.hidden) > 0, "hidden", self.hidden, "one or more positive widths")
         rates_of("dropout", self.dropout, len(self.hidden))
+        rates_of("last_dropout", self.last_dropout or 0.0, 1)
         require(all(index >= 0 for index in self.angles), "angles", self.angles, "non-negative indices")
         require(len(set(self.angles)) == len(self.angles), "angles", self.angles, "indices without repetition")
         super()._check()
@@ -45,7 +49,8 @@ class MLPConfig(TrainingConfig):
     @property
     def rates(self) -> tuple[float, ...]:
         """Dropout rate of every hidden layer."""
-        return rates_of("dropout", self.dropout, len(self.hidden))
+        rates = rates_of("dropout", self.dropout, len(self.hidden))
+        return rates if self.last_dropout is None else (*rates[:-1], self.last_dropout)
 
     @property
     def layout(self) -> MaskLayout:
