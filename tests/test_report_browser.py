@@ -21,6 +21,7 @@ from safeswitch.files import load_json
 from safeswitch.publish import publish
 from safeswitch.report import NAME, write_report
 from safeswitch.scoring import read_csv
+from safeswitch.scoring.metrics import OTHERS
 
 webdriver = pytest.importorskip("selenium.webdriver")
 from selenium.webdriver.common.keys import Keys  # noqa: E402
@@ -145,6 +146,23 @@ def test_numbers_at_each_marked_threshold_are_those_of_the_leaderboard(page: Pat
                 assert "the same numbers" in mark["check"], mark
                 checked += 1
     assert checked >= 50
+
+
+def test_a_method_that_stands_twice_is_shown_at_its_own_threshold(page: Path, browse: Callable[..., Any]) -> None:
+    driver, board = browse(), read_csv(page.parent / "leaderboard.csv")
+    if "calibrated_on" not in board or not (board["calibrated_on"] == OTHERS).any():
+        pytest.skip("no method has a threshold from other disturbances")
+    twice = "state.marks.filter((mark) => mark.on).map((mark) => mark.method)"
+    both = f"return {twice}.filter((name) => state.marks.some((mark) => mark.method === name && !mark.on))"
+    for method in driver.execute_script(both):
+        driver.execute_script("chooseMethod(arguments[0])", method)
+        assert driver.execute_script("return [state.mark.method, state.mark.on]") == [method, ""], method
+        labels = driver.execute_script(
+            "return [...document.querySelectorAll('.labels .chosen')].map((t) => t.textContent)"
+        )
+        assert method in labels, "named in the plane, and not by its dagger alone"
+    driver.execute_script("chooseView()")
+    assert driver.execute_script("return state.mark.on") == "", "as the page opens"
 
 
 def test_the_keyboard_moves_the_slider_and_everything_follows(browse: Callable[..., Any]) -> None:

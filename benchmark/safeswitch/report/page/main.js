@@ -83,8 +83,8 @@ function chooseView() {
   state.sweep = makeSweep(state.view);
   state.marks = marksOf(state.view);
   state.referenceOfView = state.learner < 0 || exact.learners.length === 1 ? reference(state.board) : NaN;
-  const wanted = state.marks.find((mark) => mark.method === state.method) || state.marks.find((mark) => mark.method.startsWith("cem@"));
-  state.mark = wanted || state.marks[0] || null;
+  state.mark = markOf(state.marks, (method) => method === state.method)
+    || markOf(state.marks, (method) => method.startsWith("cem@")) || state.marks[0] || null;
   state.threshold = state.mark ? state.mark.value : fromShare(0.5, ...axisOf(state.view));
   drawMosaic(state);
   drawMarkButtons(state);
@@ -149,7 +149,7 @@ function chooseMethod(method) {
     state.signal = $("signal").value = signal;
     chooseView();
   } else if (known && state.marks.some((mark) => mark.method === method)) {
-    state.mark = state.marks.find((mark) => mark.method === method);
+    state.mark = markOf(state.marks, (each) => each === method);
     state.threshold = state.mark.value;
     drawEverything();
   } else {

@@ -120,19 +120,18 @@ function planeLabels(points, state, x, y, width) {
   const layer = svg("g", { class: "labels", "aria-hidden": "true" });
   const taken = points.map((row) => [x(row.autonomy) - 6, y(row.success) - 6, x(row.autonomy) + 6, y(row.success) + 6]);
   const named = points.map((row) => ({ row, rank: rankOf(row, state) })).filter(({ rank }) => rank < UNNAMED);
-  for (const { row } of named.sort((a, b) => a.rank - b.rank)) {
+  for (const { row, rank } of named.sort((a, b) => a.rank - b.rank)) {
     const chosen = row.method === state.method;
     const [px, py, size] = [x(row.autonomy), y(row.success), widthOf(signed(row), `${chosen ? "bold " : ""}11.5px`)];
-    for (const [dx, dy, anchor] of PLACES) {
+    const places = PLACES.map(([dx, dy, anchor]) => {
       const left = px + dx - BEFORE[anchor] * size;
-      const box = [left, py + dy - 11, left + size, py + dy + 3];
-      const outside = box[0] < PLANE.left || box[2] > width - 2 || box[1] < 8 || box[3] > y.from;
-      if (outside || taken.some((other) => overlap(box, other))) continue;
-      taken.push(box);
-      const place = { x: px + dx, y: py + dy, "text-anchor": anchor, class: chosen ? "chosen" : null };
-      layer.append(svg("text", place, signed(row)));
-      break;
-    }
+      return { at: { x: px + dx, y: py + dy, "text-anchor": anchor }, box: [left, py + dy - 11, left + size, py + dy + 3] };
+    }).filter(({ box }) => box[0] >= PLANE.left && box[2] <= width - 2 && box[1] >= 8 && box[3] <= y.from);
+    // The chosen method is named even if the name must cover other points: else its dagger's name would stand for it.
+    const place = places.find(({ box }) => !taken.some((other) => overlap(box, other))) || (rank === 0 && places[0]);
+    if (!place) continue;
+    taken.push(place.box);
+    layer.append(svg("text", { ...place.at, class: chosen ? "chosen" : null }, signed(row)));
   }
   return layer;
 }

@@ -32,6 +32,12 @@ function marksOf(view) {
   }).sort((a, b) => a.value - b.value);
 }
 
+// The mark of a method: its own, before the one whose threshold comes from other disturbances.
+function markOf(marks, wanted) {
+  const found = marks.filter((mark) => wanted(mark.method));
+  return found.find((mark) => !strange(mark)) || found[0];
+}
+
 function marginsOf(view) {
   const margins = view.about.margins[`${view.cell}/${view.protocol}`];
   const place = view.learner < 0 ? 0 : 1 + view.task.exact.learners.indexOf(view.learner);
