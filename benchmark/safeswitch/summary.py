@@ -97,7 +97,8 @@ def headline(task: Task, table: pd.DataFrame) -> list[dict[str, Any]]:
 
 def headline_table(rows: Sequence[dict[str, Any]]) -> Table:
     """The same as a table for people, narrow enough for 80 columns."""
-    table = Table(box=box.SIMPLE_HEAD, title="The paper's cell of each task", title_justify="left", title_style="bold")
+    title = "The paper's cell of each task, armed at onset and at start"
+    table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left", title_style="bold")
     table.add_column("method", no_wrap=True)
     table.add_column("")
     for heading in ("return", "success", "autonomy"):
