@@ -35,7 +35,7 @@ test: setup ## run the tests, without the slow ones
 
 # With every extra that some slow test would be skipped without.
 test-slow: ## run the slow tests: packaging, long properties, full protocols, the report in a browser, documentation
-	@bash scripts/setup.sh dev,browser,docs,perf,rl,tensorboard
+	@bash scripts/setup.sh dev,browser,docs,perf,rl,tensorboard,video
 	$(BIN)/python -m pytest -m slow -n $(TEST_JOBS)
 
 perf: ## time the expert, pictures, decisions from images and the handover table, each beside a rival
