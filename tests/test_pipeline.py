@@ -16,6 +16,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from joblib import Parallel, delayed
+from joblib.externals.loky import get_reusable_executor
 
 from micro import MICRO, TASK, leaderboard_bytes, micro_run
 from safeswitch import execution, pipeline, scoring_stages, stages
@@ -324,6 +326,22 @@ def test_a_stage_of_several_tasks_is_one_queue_and_is_shown_once(tmp_path: Path,
     assert capsys.readouterr().err == "", "nothing is left to do, and it was shown before"
     Run(TASK, MICRO, store).finish("training", jobs[runs[1]])
     assert "training: kept from before" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("given", "seen"), [(None, "1"), ("2", "2")])
+def test_workers_draw_in_their_own_thread_unless_told_otherwise(
+    monkeypatch: pytest.MonkeyPatch, given: str | None, seen: str
+) -> None:
+    """Mesa's own threads would fight over the cores that the workers are on."""
+    name = "LP_NUM_THREADS"
+    monkeypatch.setenv(name, given or "")
+    if given is None:
+        monkeypatch.delenv(name)
+    get_reusable_executor().shutdown()  # its workers were born before
+    with execution.processes(2):
+        assert Parallel()(delayed(os.environ.get)(name) for _ in range(4)) == [seen] * 4
+    assert os.environ.get(name) == given
+    get_reusable_executor().shutdown()
 
 
 def test_a_run_computes_stages_only_when_they_are_asked_for(tmp_path: Path) -> None:

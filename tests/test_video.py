@@ -23,6 +23,7 @@ from safeswitch.scoring.video import (
     TRACE,
     Trace,
     observations,
+    replay,
     replay_frames,
     sees_images,
     write_side_by_side,
@@ -132,7 +133,8 @@ def is_colour(picture: Any, colour: tuple[int, ...]) -> Any:
 @pytest.mark.rendering
 def test_tiles_of_a_state_task(state: tuple[Any, Episode]) -> None:
     env, episode = state
-    plain, traced = replay_frames(env, episode, "rule"), replay_frames(env, episode, "rule", trace_of(episode, 0.06))
+    seen = replay(env, episode)
+    plain, traced = (replay_frames(episode, seen, "rule", trace) for trace in (None, trace_of(episode, 0.06)))
     assert not sees_images(env) and len(plain) == len(traced) == episode.length
     assert plain[0].shape == (TILE, 288 + 2 * BORDER, 3)  # 144 x 96 at the tile's height
     assert traced[0].shape == (TILE, 288 + TRACE + 3 * BORDER, 3)
@@ -147,7 +149,7 @@ def test_a_film_shows_the_pixels_that_the_learner_saw(image: tuple[Any, Episode]
     env, episode = image
     seen = observations(env, episode, range(episode.horizon + 5))
     assert sees_images(env) and list(seen) == list(range(episode.length))
-    frames = replay_frames(env, episode, "rule", trace_of(episode, env.control_dt))
+    frames = replay_frames(episode, replay(env, episode), "rule", trace_of(episode, env.control_dt))
     left = 2 * BORDER + 192
     for step in (0, episode.onset - 1, episode.onset, episode.length - 1):
         view = frames[step][BAR : BAR + HEIGHT, left : left + HEIGHT]
@@ -164,7 +166,7 @@ def test_film_of_four_drivers_is_small_and_as_long_as_its_longest(
     image: tuple[Any, Episode], tmp_path: Path, suffix: str
 ) -> None:
     env, episode = image
-    frames = replay_frames(env, episode, "rule", trace_of(episode, env.control_dt))
+    frames = replay_frames(episode, replay(env, episode), "rule", trace_of(episode, env.control_dt))
     path, fps = tmp_path / f"film{suffix}", round(1 / env.control_dt)
     frames = frames if suffix == ".mp4" else frames[:12]
     write_side_by_side([frames, frames[:8], frames, frames[:10]], path, fps, columns=2)
@@ -180,7 +182,7 @@ def test_film_of_four_drivers_is_small_and_as_long_as_its_longest(
 @pytest.mark.rendering
 def test_an_empty_place_of_the_grid_is_black(state: tuple[Any, Episode], tmp_path: Path) -> None:
     env, episode = state
-    frames = replay_frames(env, episode, "rule")[:3]
+    frames = replay_frames(episode, replay(env, episode), "rule")[:3]
     write_side_by_side([frames] * 3, tmp_path / "film.gif", 2, columns=2)
     first = np.asarray(imageio.mimread(tmp_path / "film.gif")[0])[..., :3]
     assert first[TILE:, frames[0].shape[1] :].max() == 0 < first[TILE:, : frames[0].shape[1]].max()
@@ -193,6 +195,6 @@ def test_a_replay_needs_snapshots(tiny_learner: Path) -> None:
     learner = BayesianLearner.load(tiny_learner)
     episode = run_episode(env, learner, [], NeverSwitch(), None, SEED)
     with pytest.raises(ValueError, match="record_snapshots=True"):
-        replay_frames(env, episode, "learner")
+        replay(env, episode)
     with pytest.raises(ValueError, match="record_snapshots=True"):
         observations(env, episode, [0])

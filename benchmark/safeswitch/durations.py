@@ -48,11 +48,13 @@ SIDE_BY_SIDE = ("training", "signal fits")
 
 def together(each: Sequence[dict[str, Stage]], workers: int) -> float:
     """Wall time of several tasks in one run, from scratch [s]; those of which nothing is known count as nothing."""
-    seconds = sum(total(found, workers) or 0.0 for found in each)
+    seconds = 0.0
+    for found in each:
+        seconds += total({name: stage for name, stage in found.items() if name not in SIDE_BY_SIDE}, workers) or 0.0
     for name in SIDE_BY_SIDE:
-        parts = [(found, found[name].jobs or 1) for found in each if name in found]
-        apart = sum(of_stage([part], name, workers) or 0.0 for part in parts)
-        seconds += min((of_stage(parts, name, workers) or apart) - apart, 0.0)
+        alone = [{name: found[name]} for found in each if name in found]
+        at_once = of_stage([(found, found[name].jobs or 1) for found in alone], name, workers)
+        seconds += at_once or sum(total(found, workers) or 0.0 for found in alone)
     return seconds
 
 

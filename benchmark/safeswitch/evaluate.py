@@ -15,7 +15,7 @@ from safeswitch.handover.episode import Episode, NeverSwitch, continue_with_expe
 from safeswitch.names import unknown
 from safeswitch.protocols import ARMINGS, Arming
 from safeswitch.scoring.stats import wilson
-from safeswitch.scoring.video import replay_frames, write_side_by_side
+from safeswitch.scoring.video import replay, replay_frames, write_side_by_side
 
 if TYPE_CHECKING:
     from safeswitch.pipeline import Run
@@ -72,7 +72,7 @@ def play(
     expert = env.make_expert()
     episode = run_episode(env, learner, signals, rule, expert, seed, arming, record_snapshots=True, adviser=adviser)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_side_by_side([replay_frames(env, episode, driver)], path, round(1 / env.control_dt))
+    write_side_by_side([replay_frames(episode, replay(env, episode), driver)], path, round(1 / env.control_dt))
     env.close()
     return episode
 
@@ -100,13 +100,14 @@ def gate(run: Run, episodes: int = 200, every: int = 5, split: suite.Split = "de
         f"expert alone, {none}": [delayed(_expert_alone)(task, none, chunk) for chunk in chunks],
         f"expert alone, {paper}": [delayed(_expert_alone)(task, paper, chunk) for chunk in chunks],
     }
-    outcomes: list[list[bool]] = []
-    with Progress(f"{task.name} gate", len(checks) * len(chunks)) as progress, processes(run.workers):
-        for found in Parallel(return_as="generator")(job for jobs in checks.values() for job in jobs):
-            outcomes.append(found)
+    pending = [(check, job) for check, jobs in checks.items() for job in jobs]
+    outcomes: dict[str, list[bool]] = {check: [] for check in checks}
+    with Progress(f"{task.name} gate", len(pending)) as progress, processes(run.workers):
+        done = Parallel(return_as="generator")(job for _, job in pending)
+        for (check, _), found in zip(pending, done, strict=True):
+            outcomes[check] += found
             progress.advance()
-    parts = (outcomes[start : start + len(chunks)] for start in range(0, len(outcomes), len(chunks)))
-    return [_gate_row(check, part) for check, part in zip(checks, parts, strict=True)]
+    return [_gate_row(check, found) for check, found in outcomes.items()]
 
 
 def _expert_alone(task: Task, cell: Cell, seeds: list[int]) -> list[bool]:
@@ -128,14 +129,13 @@ def _handed_over(task: Task, cell: Cell, learner: str, seeds: list[int], every: 
     return table.outcome(episode, steps[step]).tolist()
 
 
-def _gate_row(name: str, outcomes: list[list[bool]]) -> dict[str, Any]:
-    flat = [outcome for chunk in outcomes for outcome in chunk]
-    low, high = wilson(sum(flat), len(flat))
+def _gate_row(name: str, outcomes: list[bool]) -> dict[str, Any]:
+    low, high = wilson(sum(outcomes), len(outcomes))
     return {
         "check": name,
-        "trials": len(flat),
-        "successes": sum(flat),
-        "success": sum(flat) / len(flat),
+        "trials": len(outcomes),
+        "successes": sum(outcomes),
+        "success": sum(outcomes) / len(outcomes),
         "lo": float(low),
         "hi": float(high),
     }

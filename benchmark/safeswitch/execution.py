@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -50,6 +51,7 @@ def finish(stage: str, jobs: Mapping[Run, Sequence[Job]]) -> None:
 
 def _run(run: Run, pending: list[Job]) -> Iterator[str]:
     """Labels of the jobs, each as soon as it is finished."""
+    # One job alone runs in this process, from where it may use processes of its own, as demonstrations do.
     with processes(min(run.workers, max(len(pending), 1))):
         yield from Parallel(return_as="generator_unordered")(
             delayed(run_job)(str(run.store.root), job) for job in pending
@@ -58,11 +60,25 @@ def _run(run: Run, pending: list[Job]) -> Iterator[str]:
 
 @contextmanager
 def processes(count: int) -> Iterator[None]:
-    """Let joblib use `count` processes of one thread each in this block."""
-    with parallel_config("loky", n_jobs=count, inner_max_num_threads=1), warnings.catch_warnings():
+    """Let joblib use `count` processes of one thread each in this block, OpenGL's included."""
+    single = parallel_config("loky", n_jobs=count, inner_max_num_threads=1)
+    with single, _born_with("LP_NUM_THREADS", "1"), warnings.catch_warnings():
         # loky replaces a worker whose memory has grown, and warns of it
         warnings.filterwarnings("ignore", message="A worker stopped while some jobs", category=UserWarning)
         yield
+
+
+@contextmanager
+def _born_with(name: str, value: str) -> Iterator[None]:
+    """Give processes that start in this block an environment variable; one that the user has set stays."""
+    if name in os.environ:
+        yield
+        return
+    os.environ[name] = value
+    try:
+        yield
+    finally:
+        del os.environ[name]
 
 
 def _label(runs: Sequence[Run], stage: str) -> str:

@@ -58,10 +58,7 @@ PART = "figures"
 def draw(folder: Path, root: str, task: Task, episodes: str, tables: CellTables, scores: str) -> None:
     """Draw the figures that need no driving learner into `folder`/figures: first learner, paper's cell."""
     store, cell = Store(Path(root)), task.paper_cell
-    target = folder / PART
-    target.mkdir(parents=True)
-    loaded = tables.load(store, task, cell)
-    rows = _own(load_frame(store.folder(episodes) / "episodes.npz"))
+    target, loaded, rows = _begin(folder, store, task, episodes, tables)
     logs = load_arrays(store.folder(episodes) / "logs.npz")
     table = _own(read_csv(store.folder(scores) / "leaderboard.csv"))
     for protocol in scoring_stages.protocols_of(cell):
@@ -77,15 +74,21 @@ def draw(folder: Path, root: str, task: Task, episodes: str, tables: CellTables,
 
 def film(folder: Path, root: str, task: Task, trained: Trained, episodes: str, tables: CellTables) -> None:
     """Drive an episode of the paper's cell under several drivers; its figure and films go into `folder`/figures."""
-    store, cell = Store(Path(root)), task.paper_cell
-    target = folder / PART
-    target.mkdir(parents=True)
-    loaded = tables.load(store, task, cell)
-    rows = _own(load_frame(store.folder(episodes) / "episodes.npz"))
-    calibration = scoring_stages.calibration_of(loaded, task, cell, "onset", seed=0)
+    target, loaded, rows = _begin(folder, Store(Path(root)), task, episodes, tables)
+    calibration = scoring_stages.calibration_of(loaded, task, task.paper_cell, "onset", seed=0)
     story = _drive_story(task, trained, loaded["test"], calibration, rows)
     _draw_episode(story, rows, target)
     _draw_film(story, target)
+
+
+def _begin(
+    folder: Path, store: Store, task: Task, episodes: str, tables: CellTables
+) -> tuple[Path, dict[str, HandoverTable], pd.DataFrame]:
+    """Where a job leaves its files, and the paper's cell: its tables by name, and its scored episodes."""
+    target = folder / PART
+    target.mkdir(parents=True)
+    rows = _own(load_frame(store.folder(episodes) / "episodes.npz"))
+    return target, tables.load(store, task, task.paper_cell), rows
 
 
 def _own(rows: pd.DataFrame) -> pd.DataFrame:
@@ -267,11 +270,11 @@ def _draw_film(story: Story, target: Path) -> None:
     for name, run in story.runs.items():
         threshold = story.thresholds.get(name)
         trace = Trace(SIGNAL, run.signals[SIGNAL], run.driver, env.control_dt, story.marks(name), threshold, limits)
-        tiles.append(replay_frames(env, run, name, trace, seen[name]))
+        tiles.append(replay_frames(run, seen[name], name, trace))
     fps = round(1 / env.control_dt)
     write_side_by_side(tiles, target / "episode.mp4", fps, columns=2)
     for name, run in story.runs.items():
-        write_side_by_side([replay_frames(env, run, name, pictures=seen[name])], target / _film_name(name), fps)
+        write_side_by_side([replay_frames(run, seen[name], name)], target / _film_name(name), fps)
     save_json(target / STORY, _story_facts(story, fps))
     env.close()
 

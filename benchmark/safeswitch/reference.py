@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import shutil
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,7 @@ from safeswitch.files import load_json, save_json
 from safeswitch.handover.published import PublishedTables, file_name, write_table
 from safeswitch.handover.served import SPLITS
 from safeswitch.handover.table import HandoverTable, concatenate
+from safeswitch.protocols import Array
 from safeswitch.stages import Job, complete_job, table_jobs
 from safeswitch.store import Key, Store
 from safeswitch.suite import Cell, Split, Task
@@ -91,8 +93,46 @@ def reference_table(task: Task, cell: Cell, split: Split, episodes: int = EPISOD
     if path.is_file():
         shipped = PublishedTables.find(path.parent).load(cell.label, cell.severity, split, SEED)
         if len(shipped) >= episodes:
-            return shipped.take(np.arange(episodes))
+            return smoothed(shipped.take(np.arange(episodes)), task)
     return record(learner, task, cell, split, episodes)
+
+
+class _Recorded:
+    """A signal whose values over one episode are known: stands in for it where it is smoothed afterwards."""
+
+    def __init__(self, name: str, values: Array) -> None:
+        self.id = name
+        self._values = values
+
+    def reset(self) -> None:
+        """Start at the episode's first step."""
+        self._step = 0
+
+    def update(self, observation: Any, prediction: Any, previous_action: Any) -> float:
+        """The recorded value of the next step."""
+        self._step += 1
+        return float(self._values[self._step - 1])
+
+
+def smoothed(table: HandoverTable, task: Task) -> HandoverTable:
+    """The table with those smoothed signals of `reference_signals` that it lacks, the same bits as when recorded."""
+    unseen: Any = None  # a recorded signal looks at nothing
+    for name in reference_signals(task):
+        base = registry.base_signal(name)
+        if name not in table.signals:
+            trace = np.full((len(table), table.horizon), np.nan)
+            for row, (values, length) in enumerate(zip(table.signals[base], table.length, strict=True)):
+                signal = registry.make_signal(name, factories={base: partial(_Recorded, base, values)})
+                signal.reset()
+                trace[row, :length] = [signal.update(unseen, unseen, None) for _ in range(length)]
+            table = table.with_signal(name, trace)
+    return table
+
+
+def unsmoothed(table: HandoverTable) -> HandoverTable:
+    """The table without its smoothed signals, which `smoothed` makes again: less to ship."""
+    kept = {name: trace for name, trace in table.signals.items() if name == registry.base_signal(name)}
+    return replace(table, signals=kept)
 
 
 def record(
@@ -156,7 +196,8 @@ def make_reference(run: Run, folder: Path | None = None) -> tuple[Path, dict[str
     tables = {}
     for cell in (run.task.none_cell, run.task.paper_cell):
         for split in SPLITS:
-            path = write_table(record(learner, run.task, cell, split, EPISODES, run.store), folder, cell, split, SEED)
+            table = unsmoothed(record(learner, run.task, cell, split, EPISODES, run.store))
+            path = write_table(table, folder, cell, split, SEED)
             tables[path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
     manifest = {
         "task": run.task.name,

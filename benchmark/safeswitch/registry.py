@@ -11,6 +11,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import re
+from collections.abc import Callable, Mapping
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -69,14 +70,19 @@ def package_folder(kind: Kind, name: str) -> Path:
     return Path(next(iter(package.__path__)))
 
 
-def make_signal(signal_id: str, context: SignalContext | None = None) -> Signal:
+def make_signal(
+    signal_id: str,
+    context: SignalContext | None = None,
+    factories: Mapping[str, Callable[..., Signal]] | None = None,
+) -> Signal:
     """A fresh signal; `total-mean3` is `total` smoothed over three steps.
 
     Args:
         signal_id: any signal by its full id.
         context: what signals that are fitted, or need the learners of the other seeds, are made from.
+        factories: unsmoothed signals by id, instead of the registered ones.
     """
-    return find("signal", "smoothed")(signal_id, context)
+    return find("signal", "smoothed")(signal_id, context, factories)
 
 
 def base_signal(signal_id: str) -> str:

@@ -20,8 +20,7 @@ from safeswitch.names import unknown
 from safeswitch.protocols import ARMINGS, Arming
 from safeswitch.suite import SPLIT_SIZE, SPLITS, Cell, Split
 
-_NAME = re.compile(r"(?P<disturbance>.+)-(?P<severity>\d+)(?:-(?P<split>calibrate|test))?-learner(?P<learner>\d+)\.npz")
-"""Files without a split are of the first format, which had test episodes only."""
+_NAME = re.compile(r"(?P<disturbance>.+)-(?P<severity>\d+)-(?P<split>calibrate|test)-learner(?P<learner>\d+)\.npz")
 
 
 def file_name(disturbance: str, severity: int, split: Split, learner: int) -> str:
@@ -56,7 +55,7 @@ class PublishedTables:
         files: dict[tuple[str, int, str, int], Path] = {}
         for path in sorted(folder.glob("*.npz")):
             if match := _NAME.fullmatch(path.name):
-                key = (match["disturbance"], int(match["severity"]), match["split"] or "test", int(match["learner"]))
+                key = (match["disturbance"], int(match["severity"]), match["split"], int(match["learner"]))
                 if key in files:
                     raise ValueError(f"{files[key].name} and {path.name} in {folder} are the same table: keep one")
                 files[key] = path

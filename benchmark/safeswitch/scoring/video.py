@@ -166,23 +166,18 @@ def replay(env: TaskEnv, episode: Episode) -> list[list[Picture]]:
 
 
 def replay_frames(
-    env: TaskEnv,
-    episode: Episode,
-    caption: str,
-    trace: Trace | None = None,
-    pictures: list[list[Picture]] | None = None,
+    episode: Episode, pictures: Sequence[list[Picture]], caption: str, trace: Trace | None = None
 ) -> list[Picture]:
     """A tile for every executed step of a recorded episode.
 
     Args:
-        env: as in `replay`.
         episode: as in `replay`.
+        pictures: what `replay` gave.
         caption: written above the pictures.
         trace: of a signal in this episode, drawn beside them.
-        pictures: what `replay` gave, which takes most of the time; asked for here where they are left out.
     """
     frames = []
-    for step, seen in enumerate(replay(env, episode) if pictures is None else pictures):
+    for step, seen in enumerate(pictures):
         parts = seen if trace is None else [*seen, trace.picture(step)]
         captions = [caption, "what the learner sees"] if len(parts) == 3 else [caption]
         frames.append(_tile(parts, captions, _remark(episode, step), Driver(int(episode.driver[step]))))
