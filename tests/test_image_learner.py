@@ -8,6 +8,7 @@ import os
 import pickle
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -39,7 +40,7 @@ SETTINGS = {
 def make_learner(actions: int = 2, shape: tuple[int, ...] = SHAPE, **options) -> DropoutVGGLearner:
     config = VGGConfig.from_json({**SMALL, **options})
     frames = FRAMES if shape == SHAPE else np.random.default_rng(0).integers(0, 256, (5, *shape), np.uint8)
-    encoding = PixelEncoding.fit([frames], config)
+    encoding = PixelEncoding.fit([frames], config).with_subspace(lambda: [frames], config)
     model = DropoutVGG(shape, actions, config, torch.Generator().manual_seed(0))
     with torch.no_grad():
         model.output.weight.mul_(5.0)  # predictions far from zero, so that errors show
@@ -109,6 +110,28 @@ def test_memory_is_the_last_frames_and_ends_with_the_episode():
     first = learner.predict(FRAMES[0], 0)
     np.testing.assert_array_equal(first.action, ahead[0].action)
     np.testing.assert_array_equal(first.features, ahead[0].features)
+
+
+@pytest.mark.parametrize("options", [{}, {"components": 3}, {"frames": 1}])
+def test_learners_that_share_an_encoder_decide_as_they_do_alone(options):
+    """In lockstep, as an ensemble drives them, and apart; in one thread and in two."""
+    first, second = make_learner(**options), make_learner(**options)
+    other = make_learner(**options, standardisation="centred")
+    assert first._stack._encode is second._stack._encode is not other._stack._encode
+    alone = {id(learner): bits(learner) for learner in (first, other)}
+    assert bits(second) == alone[id(first)]
+    for learner in (first, second, other):
+        learner.reset(11)
+    for step, frame in enumerate(FRAMES):
+        apart = second.predict(FRAMES[-1 - step], step)
+        both = [first.predict(frame, step), other.predict(frame, step)]
+        for learner, prediction in zip((first, other), both, strict=True):
+            parts = (prediction.action, prediction.epistemic_var, prediction.aleatoric_var, prediction.features)
+            assert b"".join(value.tobytes() for value in parts) in alone[id(learner)]
+        assert apart.features.shape == both[0].features.shape
+    with ThreadPoolExecutor(2) as pool:
+        each = pool.map(lambda learner: [bits(learner) for _ in range(4)], [first, second])
+        assert list(each) == 2 * [4 * [alone[id(first)]]]
 
 
 def test_features_are_kept_when_the_next_decision_is_made():

@@ -7,8 +7,11 @@ of (episode seed, step) alone, as the masks of all learners are (`dropout.MaskSt
 
 from __future__ import annotations
 
+import hashlib
+import threading
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 import torch
@@ -25,6 +28,53 @@ if TYPE_CHECKING:
     from safeswitch_baselines.learners.descent import Progress
 
 
+class _SharedEncoder(threading.local):
+    """What the network sees of a stack of frames; of the last stack it is remembered, in each thread its own.
+
+    Learners of the same demonstrations encode alike. They share an encoder, so that an ensemble encodes a stack once.
+    """
+
+    def __init__(self, encoding: PixelEncoding, frames: int) -> None:
+        height, width, self._depth = encoding.observation_shape
+        self._differences = encoding.change is not None
+        self._scale, self._offset = encoding.factors(frames)
+        self._excess = encoding.excess()
+        self._frames = np.full((height, width, frames * self._depth), np.nan, np.float32)
+        channels = (frames + (self._excess is not None)) * self._depth
+        self._encoded = np.zeros((1, height, width, channels), np.float32)
+        self._tensor = torch.from_numpy(self._encoded).permute(0, 3, 1, 2)
+
+    def __call__(self, frames: NDArray[np.float32]) -> torch.Tensor:
+        """The encoded stack (1, channels, H, W) of frames (H, W, F C), valid until the next call."""
+        if np.array_equal(frames, self._frames):
+            return self._tensor
+        depth = self._depth
+        self._frames[...] = frames
+        encoded = self._encoded[0, ..., : frames.shape[-1]]
+        encoded[...] = frames
+        if self._differences:
+            encoded[..., :-depth] = frames[..., depth:] - frames[..., :-depth]
+        np.multiply(encoded, self._scale, out=encoded)
+        np.add(encoded, self._offset, out=encoded)
+        if self._excess is not None:
+            newest = torch.from_numpy(np.ascontiguousarray(encoded[None, ..., -depth:]))
+            self._encoded[..., -depth:] = self._excess(newest).numpy()
+        return self._tensor
+
+
+_encoders: WeakValueDictionary[str, _SharedEncoder] = WeakValueDictionary()
+
+
+def _shared_encoder(encoding: PixelEncoding, frames: int) -> _SharedEncoder:
+    """The one encoder of stacks of so many frames under these very numbers."""
+    digest = hashlib.sha256(str(frames).encode())
+    for name, array in encoding.arrays().items():
+        digest.update(f"{name} {array.shape}".encode() + array.tobytes())
+    encoder = _encoders.get(digest.hexdigest()) or _SharedEncoder(encoding, frames)
+    _encoders[digest.hexdigest()] = encoder
+    return encoder
+
+
 class FrameStack:
     """The last F frames, and from them what the network sees.
 
@@ -35,13 +85,8 @@ class FrameStack:
 
     def __init__(self, encoding: PixelEncoding, frames: int) -> None:
         height, width, self._depth = encoding.observation_shape
-        self._differences = encoding.change is not None
-        self._scale, self._offset = encoding.factors(frames)
-        self._excess = encoding.excess()
         self._frames = np.zeros((height, width, frames * self._depth), np.float32)
-        channels = (frames + (self._excess is not None)) * self._depth
-        self._encoded = np.zeros((1, height, width, channels), np.float32)
-        self._tensor = torch.from_numpy(self._encoded).permute(0, 3, 1, 2)
+        self._encode = _shared_encoder(encoding, frames)
         self.reset()
 
     def reset(self) -> None:
@@ -49,24 +94,18 @@ class FrameStack:
         self._empty = True
 
     def push(self, frame: NDArray[np.uint8]) -> torch.Tensor:
-        """Take the next frame (H, W, C) in; the encoded stack (1, F C, H, W), valid until the next call."""
+        """Take the next frame (H, W, C) in; the encoded stack (1, F C, H, W), valid until the next call.
+
+        The next call may be another stack's with the same encoding.
+        """
         depth, frames = self._depth, self._frames
-        encoded = self._encoded[0, ..., : frames.shape[-1]]
         if self._empty:
             frames[...] = np.tile(frame, frames.shape[-1] // depth)
             self._empty = False
         else:
             frames[..., :-depth] = frames[..., depth:]
             frames[..., -depth:] = frame
-        encoded[...] = frames
-        if self._differences:
-            encoded[..., :-depth] = frames[..., depth:] - frames[..., :-depth]
-        np.multiply(encoded, self._scale, out=encoded)
-        np.add(encoded, self._offset, out=encoded)
-        if self._excess is not None:
-            newest = torch.from_numpy(np.ascontiguousarray(encoded[None, ..., -depth:]))
-            self._encoded[..., -depth:] = self._excess(newest).numpy()
-        return self._tensor
+        return self._encode(frames)
 
 
 class DropoutVGGLearner(TrainedLearner[DropoutVGG, PixelEncoding, VGGConfig]):
