@@ -289,7 +289,7 @@ def test_the_commands_from_submission_to_verified_row(
 ) -> None:
     monkeypatch.setitem(suite.PROFILES, "micro", MICRO)
     monkeypatch.setattr(console, "quiet", False)
-    monkeypatch.setenv("COLUMNS", "300")
+    monkeypatch.setattr(console, "width", 300)  # whatever COLUMNS was when the console was made
     store, results = ["--store", str(tmp_path / "store")], ["--results", str(tmp_path / "results")]
 
     def run(*arguments: str) -> tuple[int, str]:
