@@ -51,9 +51,12 @@ def demonstrations() -> Demonstrations:
     return Demonstrations(FRAMES, np.zeros((20, 2)), np.repeat([0, 1, 2], [9, 1, 10]))
 
 
-def bits(learner: DropoutVGGLearner, seed: int = 11) -> bytes:
+def bits(learner: DropoutVGGLearner, seed: int = 11, frames=FRAMES) -> bytes:
     learner.reset(seed)
-    predictions = [learner.predict(frame, step) for step, frame in enumerate(FRAMES)]
+    return bytes_of([learner.predict(frame, step) for step, frame in enumerate(frames)])
+
+
+def bytes_of(predictions) -> bytes:
     parts = ((p.action, p.epistemic_var, p.aleatoric_var, p.features) for p in predictions)
     return b"".join(value.tobytes() for values in parts for value in values if value is not None)
 
@@ -118,20 +121,17 @@ def test_learners_that_share_an_encoder_decide_as_they_do_alone(options):
     first, second = make_learner(**options), make_learner(**options)
     other = make_learner(**options, standardisation="centred")
     assert first._stack._encode is second._stack._encode is not other._stack._encode
-    alone = {id(learner): bits(learner) for learner in (first, other)}
-    assert bits(second) == alone[id(first)]
-    for learner in (first, second, other):
+    alone = bits(first)
+    assert bits(second) == alone
+    driven = [(first, FRAMES), (second, FRAMES[::-1]), (other, FRAMES)]
+    apart = [bits(learner, frames=frames) for learner, frames in driven]
+    for learner, _ in driven:
         learner.reset(11)
-    for step, frame in enumerate(FRAMES):
-        apart = second.predict(FRAMES[-1 - step], step)
-        both = [first.predict(frame, step), other.predict(frame, step)]
-        for learner, prediction in zip((first, other), both, strict=True):
-            parts = (prediction.action, prediction.epistemic_var, prediction.aleatoric_var, prediction.features)
-            assert b"".join(value.tobytes() for value in parts) in alone[id(learner)]
-        assert apart.features.shape == both[0].features.shape
+    in_turn = [[learner.predict(frames[step], step) for learner, frames in driven] for step in range(len(FRAMES))]
+    assert [bytes_of(each) for each in zip(*in_turn, strict=True)] == apart
     with ThreadPoolExecutor(2) as pool:
         each = pool.map(lambda learner: [bits(learner) for _ in range(4)], [first, second])
-        assert list(each) == 2 * [4 * [alone[id(first)]]]
+        assert list(each) == 2 * [4 * [alone]]
 
 
 def test_features_are_kept_when_the_next_decision_is_made():
